@@ -1,0 +1,45 @@
+# make fly    fly the SITL pair over a laggy link, over UDP on this machine
+# make test   the test suite (under 10 minutes)
+# make check  what CI runs: format, lint, types, import contract
+PYTHON ?= python3
+VENV ?= .venv
+BIN := $(VENV)/bin
+FLIGHT ?= nominal
+
+.PHONY: setup fly test check check-long bench format clean
+
+setup: $(VENV)/ready
+
+$(VENV)/ready: pyproject.toml constraints.txt
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+		{ echo "make: $(PYTHON) is older than Python 3.11; say PYTHON=python3.12, for example" >&2; exit 2; }
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
+	@# a ground station for the tests; its own list of requirements holds a desktop that headless use leaves out
+	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt --no-deps MAVProxy
+	@touch $@
+
+fly: setup
+	$(BIN)/sitl fly $(FLIGHT)
+
+test: setup
+	$(BIN)/pytest -m "not long"
+
+check: setup
+	$(BIN)/ruff format --check
+	$(BIN)/ruff check
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+check-long: setup
+	$(BIN)/pytest -m long
+
+bench: setup
+	$(BIN)/python -m tests.bench
+
+format: setup
+	$(BIN)/ruff format
+	$(BIN)/ruff check --fix
+
+clean:
+	rm -rf $(VENV) build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis

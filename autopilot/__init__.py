@@ -1,0 +1,1 @@
+"""Autopilot: flies the gains over MAVLink, whatever the link does to the messages."""

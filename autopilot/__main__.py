@@ -1,0 +1,111 @@
+"""The ``autopilot`` program: flies one set of gains over MAVLink."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+import click
+
+from autopilot.app import AutopilotConfig, AutopilotNode
+from autopilot.link.clock import NS_PER_S, Clock
+from autopilot.link.process import ADDRESS, ProcessOptions, process_options, run_node
+from autopilot.link.udp import Address, dial
+from autopilot.reference import parse_profile
+from gains.command import run, version
+from gains.store import load_gains
+from gains.table import InputError
+
+__all__ = ["main"]
+
+MAX_GROUND_STATIONS = 8
+
+
+@click.command()
+@click.option("--gains", "gains_name", default="hirm-paper", show_default=True, help="Stored gains, or a gain file.")
+@click.option(
+    "--plant",
+    type=ADDRESS,
+    default="udpout:127.0.0.1:14601",
+    show_default=True,
+    help="The plant, or the relay before it.",
+)
+@click.option(
+    "--gcs",
+    multiple=True,
+    default=("udpout:127.0.0.1:14550",),
+    show_default=True,
+    help='A ground station; may be repeated; "none" for none.',
+)
+@click.option("--reference", default="", help="Pitch reference: 5deg@1s,0deg@6s is 5 degrees at 1 s, 0 at 6 s.")
+@click.option(
+    "--actuator",
+    type=click.Choice(["pwm", "float"]),
+    default="pwm",
+    show_default=True,
+    help="SERVO_OUTPUT_RAW, or HIL_ACTUATOR_CONTROLS without quantisation.",
+)
+@click.option(
+    "--failsafe",
+    type=click.Choice(["on", "monitor"]),
+    default="on",
+    show_default=True,
+    help="monitor: report transitions, fly the law all the same.",
+)
+@click.option(
+    "--hold",
+    "hold_s",
+    type=click.FloatRange(0.0, 60.0),
+    default=0.5,
+    show_default=True,
+    help="Seconds that failsafe holds the last command before neutral.",
+)
+@click.option("--require-certificate", is_flag=True, help="Refuse gains without a verified certificate.")
+@process_options
+@click.version_option(version())
+def cli(
+    gains_name: str,
+    plant: Address,
+    gcs: tuple[str, ...],
+    reference: str,
+    actuator: Literal["pwm", "float"],
+    failsafe: Literal["on", "monitor"],
+    hold_s: float,
+    require_certificate: bool,
+    clock: Clock,
+    record: Path | None,
+    stream: Address | None,
+) -> None:
+    """Fly GAINS: state from the plant over MAVLink in, elevator commands out, whatever the link does.
+
+    Runs until Ctrl-C. Telemetry goes to the ground stations, the control link to the plant; each port
+    hears its one peer and nobody else.
+    """
+    gains = load_gains(gains_name)
+    if require_certificate:
+        raise InputError(f"gains {gains.name}: no verified certificate, and --require-certificate is given")
+    stations = [ADDRESS.convert(text, None, None) for text in gcs if text != "none"]
+    if len(stations) > MAX_GROUND_STATIONS:
+        raise InputError(f"--gcs: expected at most {MAX_GROUND_STATIONS} ground stations, found {len(stations)}")
+    config = AutopilotConfig(
+        gains=gains,
+        profile=parse_profile(reference, gains.model.Ts),
+        actuator=actuator,
+        failsafe=failsafe,
+        hold_ns=round(hold_s * NS_PER_S),
+        ground_stations=len(stations),
+    )
+    node = AutopilotNode(config)
+    ports = [dial("plant", plant), *(dial(f"gcs{i}", address) for i, address in enumerate(stations))]
+    click.echo(f"autopilot: gains {gains.name} (no verified certificate), plant {plant[0]}:{plant[1]}", err=True)
+    metadata = {"program": "autopilot", "gains": gains.name, "version": version()}
+    run_node("autopilot", node, ports, ProcessOptions(clock, record, stream), metadata, tap=True)
+
+
+def main() -> None:
+    """Run the ``autopilot`` command."""
+    run(cli, "autopilot")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,390 @@
+"""The autopilot as a Node: wiring of clock, samples, delay, reference, law and failsafe; no rule of its own.
+
+One complete sample of the plant makes one command. Start-up: TIMESYNC runs until the delay can be
+forecast, and only then the first heartbeat goes to the plant, whose clockwork starts with it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+
+from autopilot.clocksync import ClockStatus, ClockSync
+from autopilot.control import limited
+from autopilot.delay import UNKNOWN, DelayEstimate, DelayEstimator
+from autopilot.failsafe import Event, FailsafeState, Limits, Mode, step
+from autopilot.link.clock import NS_PER_MS, NS_PER_S, NS_PER_US
+from autopilot.link.node import Datagram, Record
+from autopilot.link.servo import travel_of
+from autopilot.link.wire import (
+    AUTOPILOT,
+    PLANT,
+    AoaSsa,
+    Attitude,
+    HilActuatorControls,
+    Message,
+    NamedValueInt,
+    ServoOutputRaw,
+    Severity,
+    StatusText,
+    Timesync,
+    VfrHud,
+    Wire,
+    autopilot_heartbeat,
+)
+from autopilot.reference import Profile, ReferenceModel, match_reference
+from autopilot.state import JUMP_BACK_NS, Sample, SampleAssembler
+from autopilot.vehicle import Vehicle
+from gains.model import Gains
+
+__all__ = ["AutopilotConfig", "AutopilotNode"]
+
+PLANT_PORT = "plant"
+HEARTBEAT_NS = NS_PER_S
+TIMESYNC_START_NS = 50 * NS_PER_MS
+TIMESYNC_NS = 100 * NS_PER_MS
+SYNC_WAIT_NS = 2 * NS_PER_S
+"""A plant that answers no TIMESYNC gets its heartbeat after this time all the same."""
+FUTURE_SLACK_NS = NS_PER_S
+"""A stamp may be later than the plant's estimated time by this much, beyond the estimate's bound."""
+COUNTERS_NS = NS_PER_S
+
+
+@dataclass(frozen=True, slots=True)
+class AutopilotConfig:
+    """What one autopilot flies, and how.
+
+    Attributes
+    ----------
+    gains : Gains
+        K1, K2, the window and the model.
+    profile : Profile
+        The programmed reference.
+    actuator : "pwm" or "float"
+        SERVO_OUTPUT_RAW or HIL_ACTUATOR_CONTROLS to the plant.
+    failsafe : "on" or "monitor"
+        "monitor" reports every transition, and lets the law fly all the same.
+    hold_ns : int
+        How long the last command is held before neutral.
+    ground_stations : int
+        Number of ports gcs0, gcs1, ...
+    """
+
+    gains: Gains
+    profile: Profile = field(default_factory=Profile)
+    actuator: Literal["pwm", "float"] = "pwm"
+    failsafe: Literal["on", "monitor"] = "on"
+    hold_ns: int = NS_PER_S // 2
+    ground_stations: int = 1
+
+
+class AutopilotNode:
+    """Node with the ports ``plant`` and ``gcs0``, ``gcs1``, ...
+
+    Raises
+    ------
+    InputError
+        When the model cannot be flown over MAVLink (sensors, actuator).
+    """
+
+    def __init__(self, config: AutopilotConfig) -> None:
+        self.config = config
+        self.model = config.gains.model
+        self.wire = Wire(AUTOPILOT, PLANT)
+        self.clock = ClockSync()
+        self.delay = DelayEstimator(self.model.Ts_ns)
+        self.samples = SampleAssembler(self.model)
+        self.travel = travel_of(self.model)
+        self.reference = self._new_reference()
+        self.limits = Limits(config.hold_ns)
+        self.failsafe = FailsafeState()
+        self.epoch = 0
+        self.vehicle = Vehicle(tuple(f"gcs{i}" for i in range(config.ground_stations)), self._banner())
+        self._u = self.travel.neutral
+        self._last: Sample | None = None
+        self._fresh_ns: int | None = None
+        self._steps_seen = 0
+        self._started_ns: int | None = None
+        self._next_heartbeat_ns: int | None = None
+        self._next_timesync_ns: int | None = None
+        self._next_repeat_ns: int | None = None
+        self._next_counters_ns: int | None = None
+        self._out: list[Datagram] = []
+        self._records: list[Record] = []
+
+    # Node
+
+    def receive(self, port: str, datagram: bytes, now_ns: int) -> None:
+        """Take one datagram from the plant or from a ground station."""
+        if port != PLANT_PORT:
+            self.vehicle.receive(port, datagram)
+            return
+        for message in self.wire.decode(datagram):
+            match message:
+                case Attitude() | AoaSsa():
+                    self._measurement(message, now_ns)
+                case Timesync():
+                    self._timesync(message, now_ns)
+                case NamedValueInt():
+                    self._named_value(message, now_ns)
+                case VfrHud():
+                    self.vehicle.saw(message, now_ns)
+                case _:
+                    pass
+
+    def tick(self, now_ns: int) -> None:
+        """Send what is due by time alone: TIMESYNC, heartbeats, failsafe's deadlines."""
+        if self._started_ns is None:
+            self._started_ns = self._next_timesync_ns = self._next_counters_ns = now_ns
+            self._announce_gains(now_ns)
+        self._tick_plant_link(now_ns)
+        self._tick_failsafe(now_ns)
+        mode = self.failsafe.mode
+        self.vehicle.tick(now_ns, tracking=mode is Mode.TRACKING, degraded=mode in (Mode.HOLD, Mode.NEUTRAL))
+        assert self._next_counters_ns is not None
+        if now_ns >= self._next_counters_ns:
+            self._next_counters_ns += COUNTERS_NS
+            self._record_counters(now_ns)
+
+    def next_deadline_ns(self) -> int | None:
+        """Return when ``tick`` is wanted; the first call is due at once."""
+        if self._started_ns is None:
+            return 0
+        return min(
+            due
+            for due in (
+                self._next_timesync_ns,
+                self._next_heartbeat_ns,
+                self._next_counters_ns,
+                self._failsafe_deadline_ns(),
+                self.vehicle.next_deadline_ns(),
+            )
+            if due is not None
+        )
+
+    def outgoing(self) -> list[Datagram]:
+        """Take away the datagrams to send, the plant's first."""
+        out, self._out = self._out, []
+        return out + self.vehicle.outgoing()
+
+    def records(self) -> list[Record]:
+        """Take away the records."""
+        records, self._records = self._records, []
+        return records
+
+    # The plant's messages
+
+    def _measurement(self, message: Attitude | AoaSsa, now_ns: int) -> None:
+        clock = self.clock.estimate(now_ns)
+        latest_ns = None
+        if clock.status is ClockStatus.LOCKED:
+            latest_ns = now_ns + clock.offset_ns + clock.bound_ns + FUTURE_SLACK_NS
+        sample = self.samples.add(message, now_ns, latest_ns)
+        if self.samples.jumped_back and self._plant_restarted():
+            self._new_epoch(now_ns)
+            sample = self.samples.add(message, now_ns, latest_ns)
+        self.vehicle.saw(message, now_ns)
+        if sample is not None:
+            self._command(sample, now_ns)
+
+    def _timesync(self, message: Timesync, now_ns: int) -> None:
+        if message.tc1 == 0:
+            self._send(Timesync(now_ns, message.ts1))
+            return
+        steps = self.clock.steps
+        if self.clock.answer(message.tc1, message.ts1, now_ns) is None:
+            return
+        if self.clock.steps > steps:
+            self.delay.forget()
+            self._event("clock", f"plant clock stepped by {self.clock.last_step_ns / NS_PER_S:+.3f} s", now_ns)
+        self.delay.transit(message.tc1, message.ts1, now_ns)
+
+    def _named_value(self, message: NamedValueInt, now_ns: int) -> None:
+        if message.name == "SAMPLE_K":
+            sample = self.samples.number(message.value, message.time_boot_ms)
+            if sample is not None:
+                self._command(sample, now_ns)
+        elif message.name == "DELAY_K":
+            self.vehicle.saw(message, now_ns)
+            if message.value > self.config.gains.d_max:
+                self._failsafe_step(Event.OUTSIDE, f"delay {message.value} reported", now_ns)
+
+    def _plant_restarted(self) -> bool:
+        """Whether the clock has stepped back since the newest sample: with stamps that jumped back, a restart."""
+        return self.clock.steps > self._steps_seen and self.clock.last_step_ns < -JUMP_BACK_NS // 2
+
+    def _new_epoch(self, now_ns: int) -> None:
+        self.epoch += 1
+        self._steps_seen = self.clock.steps
+        self.samples.restart()
+        self.reference = self._new_reference()
+        self._last = self._fresh_ns = None
+        self._u = self.travel.neutral
+        self._event("epoch", f"plant restarted, epoch {self.epoch}", now_ns)
+        self._failsafe_step(Event.RESTARTED, "plant restarted", now_ns)
+
+    # One command per sample
+
+    def _command(self, sample: Sample, now_ns: int) -> None:
+        """Compute and send the command of one sample."""
+        if self._last is not None and sample.j <= self._last.j:
+            return
+        self._steps_seen = self.clock.steps
+        gains = self.config.gains
+        forecast = self.delay.forecast(sample.t_ns, now_ns)
+        inside = forecast.d is not None and gains.d_min <= forecast.d <= gains.d_max
+        was = self.failsafe.mode
+        self._fresh_ns, self._last = now_ns, sample
+        reason = "delay unknown" if forecast.d is None else f"delay {forecast.d}"
+        self._failsafe_step(Event.GOOD if inside else Event.OUTSIDE, reason, now_ns)
+        if self.reference is not None:
+            self.reference.advance(sample.j)
+            if self.failsafe.mode is Mode.TRACKING and was in (Mode.HOLD, Mode.NEUTRAL):
+                self._match_reference(sample)
+        ahead = forecast.d if forecast.d is not None else gains.d_min
+        xr = self.reference.ahead(ahead) if self.reference is not None else None
+        saturated = False
+        if self.failsafe.mode is Mode.TRACKING or self.config.failsafe == "monitor":
+            self._u, saturated = limited(self.model, self.travel, gains.K1, gains.K2, sample.x, xr)
+        elif self.failsafe.mode is not Mode.HOLD:
+            self._u = self.travel.neutral
+        self._next_repeat_ns = now_ns + self.model.Ts_ns
+        self._send_command(sample, now_ns)
+        self._record_command(sample, forecast, xr, saturated, now_ns)
+
+    def _match_reference(self, sample: Sample) -> None:
+        """Let the reference go on from where the aircraft is: re-entry without a jump of the elevator."""
+        gains = self.config.gains
+        if self.reference is None or gains.K2 is None or self.config.failsafe == "monitor":
+            return
+        dx = sample.x - self.model.trim.x
+        self.reference.xr = match_reference(self.model, gains.K1, gains.K2, dx, self._u - self.travel.neutral)
+
+    def _send_command(self, sample: Sample, now_ns: int) -> None:
+        stamp_us = sample.t_ns // NS_PER_US
+        pulse_us = self.travel.to_pwm(self._u)
+        if self.config.actuator == "float":
+            self._send(HilActuatorControls(stamp_us, self.travel.to_control(self._u)))
+        else:
+            self._send(ServoOutputRaw(stamp_us, pulse_us))
+        self.vehicle.flew(pulse_us, now_ns)
+
+    def _new_reference(self) -> ReferenceModel | None:
+        if self.model.reference is None:
+            return None
+        return ReferenceModel(self.model.reference, self.config.profile)
+
+    # Time
+
+    def _tick_plant_link(self, now_ns: int) -> None:
+        """Send TIMESYNC and, once the delay can be forecast, the heartbeat that starts the plant."""
+        assert self._started_ns is not None
+        assert self._next_timesync_ns is not None
+        if self._next_heartbeat_ns is None:
+            ready = self.delay.forecast(0, now_ns) is not UNKNOWN
+            if ready or now_ns - self._started_ns >= SYNC_WAIT_NS:
+                self._next_heartbeat_ns = now_ns
+        if now_ns >= self._next_timesync_ns:
+            starting = self._next_heartbeat_ns is None
+            self._next_timesync_ns = now_ns + (TIMESYNC_START_NS if starting else TIMESYNC_NS)
+            self._send(Timesync(0, self.clock.request(now_ns)))
+        if self._next_heartbeat_ns is not None and now_ns >= self._next_heartbeat_ns:
+            self._next_heartbeat_ns += HEARTBEAT_NS
+            tracking = self.failsafe.mode is Mode.TRACKING
+            self._send(autopilot_heartbeat(tracking=tracking, degraded=False))
+
+    def _tick_failsafe(self, now_ns: int) -> None:
+        """Raise STALE and EXPIRED when their time has come; repeat neutral while no sample comes."""
+        due_ns = self._failsafe_deadline_ns()
+        if due_ns is None or now_ns < due_ns:
+            return
+        match self.failsafe.mode:
+            case Mode.TRACKING:
+                self._failsafe_step(Event.STALE, f"no state for {self.config.gains.d_max} samples", now_ns)
+            case Mode.HOLD:
+                self._failsafe_step(Event.EXPIRED, "no recovery", now_ns)
+            case _:
+                pass
+        if self.failsafe.mode is Mode.NEUTRAL and self._last is not None and self.config.failsafe == "on":
+            self._u = self.travel.neutral
+            self._next_repeat_ns = now_ns + self.model.Ts_ns
+            self._send_command(self._last, now_ns)
+
+    def _failsafe_deadline_ns(self) -> int | None:
+        """Return when the present mode ends, or repeats its command, if no sample comes."""
+        match self.failsafe.mode:
+            case Mode.TRACKING:
+                assert self._fresh_ns is not None
+                return self._fresh_ns + self.config.gains.d_max * self.model.Ts_ns
+            case Mode.HOLD:
+                return self.failsafe.since_ns + self.limits.hold_ns
+            case Mode.NEUTRAL if self.config.failsafe == "on":
+                return self._next_repeat_ns
+            case _:
+                return None
+
+    def _failsafe_step(self, event: Event, reason: str, now_ns: int) -> None:
+        """Take one event; every change of mode is a STATUSTEXT and a record."""
+        before = self.failsafe.mode
+        self.failsafe = step(self.failsafe, event, now_ns, self.limits)
+        after = self.failsafe.mode
+        if after is before:
+            return
+        worse = after in (Mode.HOLD, Mode.NEUTRAL)
+        text = f"{before} to {after}: {reason}"
+        self.vehicle.say(Severity.WARNING if worse else Severity.NOTICE, text)
+        data = {"from": before, "to": after, "event": event, "monitor": self.config.failsafe == "monitor"}
+        self._event("failsafe", text, now_ns, data)
+
+    # Output
+
+    def _send(self, message: Message) -> None:
+        self._out.append((PLANT_PORT, self.wire.encode(message)))
+
+    def _banner(self) -> list[StatusText]:
+        """Return what a ground station must know at start: gains without proof say so."""
+        gains = self.config.gains
+        text = f"gains {gains.name}: no verified certificate"
+        return [StatusText(Severity.WARNING, text)]
+
+    def _announce_gains(self, now_ns: int) -> None:
+        gains = self.config.gains
+        data = {"gains": gains.name, "d_min": gains.d_min, "d_max": gains.d_max, "verified": False}
+        self._event("gains", self.vehicle.banner[0].text, now_ns, data)
+
+    def _event(self, kind: str, text: str, now_ns: int, data: dict[str, object] | None = None) -> None:
+        body = {"kind": kind, "node": "autopilot", "text": text, "data": data or {}}
+        self._records.append(Record("events", now_ns, body))
+
+    def _record_command(
+        self, sample: Sample, forecast: DelayEstimate, xr: np.ndarray | None, saturated: bool, now_ns: int
+    ) -> None:
+        body = {
+            "j": sample.j,
+            "sample_ns": sample.t_ns,
+            "epoch": self.epoch,
+            "x": sample.x.tolist(),
+            "xr": xr.tolist() if xr is not None else None,
+            "r": [self.config.profile.r(sample.j)] if xr is not None else None,
+            "u": [self._u],
+            "saturated": saturated,
+            "d": forecast.d,
+            "d_low": forecast.low,
+            "d_high": forecast.high,
+            "status": forecast.status,
+            "mode": self.failsafe.mode,
+        }
+        self._records.append(Record("autopilot/command", now_ns, body))
+
+    def _record_counters(self, now_ns: int) -> None:
+        clock = self.clock.estimate(now_ns)
+        data = {
+            "rejects": {kind.value: n for kind, n in self.wire.rejects.items()},
+            "drops": {kind.value: n for kind, n in self.samples.drops.items()},
+            "timesync_unmatched": self.clock.unmatched,
+            "clock": clock.status,
+            "clock_bound_ns": clock.bound_ns,
+        }
+        self._event("counters", "autopilot counters", now_ns, data)

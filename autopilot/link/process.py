@@ -1,0 +1,178 @@
+"""One node as an operating-system process: common options, signals, where its records go, how it ends.
+
+Ctrl-C, SIGTERM and the end of the record stream all end the process in the same way: the loop stops
+between two passes, the records are passed on, the files are closed.
+"""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+import click
+
+from autopilot.link.clock import NS_PER_S, Clock
+from autopilot.link.node import Node, Record
+from autopilot.link.record import McapRecorder
+from autopilot.link.stream import StreamSink
+from autopilot.link.udp import Address, RecordSink, UdpDriver, UdpPort, parse_address, true_ns
+from gains.table import InputError
+
+__all__ = ["ADDRESS", "CLOCK", "ProcessOptions", "format_clock", "parse_clock", "process_options", "run_node"]
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+
+@dataclass(frozen=True, slots=True)
+class ProcessOptions:
+    """What every program that runs a node can be told.
+
+    Attributes
+    ----------
+    clock : Clock
+        The node's clock.
+    record : Path or None
+        MCAP file of its own.
+    stream : Address or None
+        Recorder to stream to.
+    """
+
+    clock: Clock
+    record: Path | None
+    stream: Address | None
+
+
+def parse_clock(text: str) -> Clock:
+    """Return the clock written as ``OFFSETs`` or ``OFFSETs:DRIFTppm``, for example ``137s:+40ppm``.
+
+    Raises
+    ------
+    InputError
+        For anything else, a negative offset, or a drift of 1 % or more.
+    """
+    offset, _, drift = text.partition(":")
+    try:
+        if not offset.endswith("s") or (drift and not drift.endswith("ppm")):
+            raise ValueError
+        offset_ns = round(float(offset.removesuffix("s")) * NS_PER_S)
+        drift_ppb = round(float(drift.removesuffix("ppm") or 0.0) * 1000)
+        if offset_ns < 0 or abs(drift_ppb) >= 10_000_000:
+            raise ValueError
+    except (ValueError, OverflowError):
+        raise InputError(f'clock "{text}": expected OFFSETs:DRIFTppm such as 137s:+40ppm') from None
+    return Clock(offset_ns, drift_ppb)
+
+
+def format_clock(clock: Clock) -> str:
+    """Return the text that :func:`parse_clock` reads back."""
+    return f"{clock.offset_ns / NS_PER_S!r}s:{clock.drift_ppb / 1000!r}ppm"
+
+
+class _Parsed(click.ParamType[Any]):
+    """A click type from a function that raises InputError."""
+
+    def __init__(self, name: str, parse: Callable[[str], Any]) -> None:
+        self.name = name
+        self._parse = parse
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """Parse text; pass on what is parsed already."""
+        return self._parse(value) if isinstance(value, str) else value
+
+
+ADDRESS = _Parsed("ADDRESS", parse_address)
+CLOCK = _Parsed("CLOCK", parse_clock)
+
+
+def process_options(command: F) -> F:
+    """Add ``--clock``, ``--record`` and ``--stream`` to a click command; it gets ``clock, record, stream``."""
+    for option in (
+        click.option("--stream", type=ADDRESS, hidden=True, help="Recorder to stream records to."),
+        click.option(
+            "--record",
+            type=click.Path(dir_okay=False, path_type=Path),
+            help="Write an MCAP recording of this program.",
+        ),
+        click.option(
+            "--clock",
+            type=CLOCK,
+            default="0s",
+            show_default=True,
+            help="The node's own clock: OFFSETs:DRIFTppm at start.",
+        ),
+    ):
+        command = option(command)
+    return command
+
+
+class _FileSink:
+    """Writes a program's own recording, its times counted from the start of the program."""
+
+    def __init__(self, recorder: McapRecorder) -> None:
+        self._recorder = recorder
+        self._start_ns = true_ns()
+
+    def write(self, record: Record, log_time_ns: int) -> None:
+        self._recorder.write(record, max(0, log_time_ns - self._start_ns))
+
+    def pump(self) -> None:
+        """Nothing waits: the recorder writes whole chunks as they fill."""
+
+
+def run_node(
+    name: str,
+    node: Node,
+    ports: Sequence[UdpPort],
+    options: ProcessOptions,
+    metadata: Mapping[str, str],
+    *,
+    tap: bool,
+) -> None:
+    """Run a node over UDP until Ctrl-C, SIGTERM or the end of the record stream.
+
+    Parameters
+    ----------
+    name : str
+        The program.
+    node, ports
+        The node, and its sockets, control ports first.
+    options : ProcessOptions
+        Clock and recordings.
+    metadata : mapping
+        Of the program's own recording.
+    tap : bool
+        Whether datagrams are recorded.
+
+    Raises
+    ------
+    InputError
+        When the recording cannot be written or the recorder is not there.
+    """
+    stopped = False
+
+    def stop(_signum: int, _frame: object) -> None:
+        nonlocal stopped
+        stopped = True
+
+    for signum in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(signum, stop)
+    with ExitStack() as stack:
+        sink: RecordSink | None = None
+        stream: StreamSink | None = None
+        if options.stream is not None:
+            bound = {port.name: port.local for port in ports}
+            sink = stream = StreamSink(options.stream, name, bound)
+            stack.callback(stream.close)
+        elif options.record is not None:
+            try:
+                recorder = stack.enter_context(McapRecorder(options.record, metadata))
+            except OSError as error:
+                raise InputError(f"{options.record}: {error.strerror or error}") from None
+            sink = _FileSink(recorder)
+        driver = UdpDriver(node, ports, options.clock, sink, tap=tap)
+        stack.callback(driver.close)
+        driver.run(lambda: stopped or (stream is not None and stream.closed))

@@ -1,0 +1,135 @@
+"""The topics of a recording: what each message says, as JSON Schema with units.
+
+The schemas hold for every message under a strict validator, and keep to what Foxglove and Lichtblick
+parse: one type per field, ``properties`` in every object. A field that may be null has two types, which
+makes these viewers refuse the whole channel where they look for it; such fields therefore stand under
+``allOf``, which validators obey and these viewers pass over.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Any
+
+__all__ = ["FRAME_SCHEMA", "SCHEMAS", "is_topic", "schema_of"]
+
+_FRAME_TOPIC = re.compile(r"mavlink/[a-z0-9_-]{1,32}")
+
+
+def _field(kind: str, description: str, *, nullable: bool = False, **more: Any) -> dict[str, Any]:
+    """Return the schema of one field: its JSON type and what it means, with its unit."""
+    return {"type": [kind, "null"] if nullable else kind, "description": description, **more}
+
+
+def _vector(description: str, *, nullable: bool = False) -> dict[str, Any]:
+    """Return the schema of an array of numbers."""
+    return _field("array", description, nullable=nullable, items={"type": "number"})
+
+
+def _schema(title: str, description: str, **fields: dict[str, Any]) -> Mapping[str, Any]:
+    """Return a topic's JSON Schema; every field is required, more fields are allowed."""
+    certain = {name: field for name, field in fields.items() if isinstance(field["type"], str)}
+    nullable = {name: field for name, field in fields.items() if name not in certain}
+    schema = {
+        "$schema": "https://json-schema.org/draft/2020-12/schema",
+        "title": title,
+        "description": description,
+        "type": "object",
+        "properties": certain,
+        "required": list(fields),
+        "additionalProperties": True,
+    }
+    if nullable:
+        schema["allOf"] = [{"properties": nullable}]
+    return MappingProxyType(schema)
+
+
+def _link_schema(title: str, way: str) -> Mapping[str, Any]:
+    """Return the schema of one direction of the link."""
+    return _schema(
+        title,
+        f"One packet on its way {way}, as the relay saw it.",
+        sent_ns=_field("integer", "When the packet entered the link, ns, relay's clock."),
+        delivered_ns=_field("integer", "When it left the link, ns, relay's clock; null if lost.", nullable=True),
+        number=_field("integer", "Number of the packet in the order of entering, from 1; copies share it."),
+        size=_field("integer", "Payload, bytes."),
+        fate=_field("string", "What the link did with it: delivered, lost, and so on."),
+        copy=_field("integer", "0 for the packet itself, 1 and up for duplicates."),
+    )
+
+
+SCHEMAS: Mapping[str, Mapping[str, Any]] = MappingProxyType(
+    {
+        "plant/truth": _schema(
+            "Plant truth",
+            "The aircraft at one sample, as it really was.",
+            k=_field("integer", "Sample number."),
+            t_ns=_field("integer", "Time of sample k, ns, plant's clock."),
+            late_ns=_field("integer", "How late the tick of sample k was served, ns."),
+            x=_vector("State at sample k, absolute, in the model's units."),
+            u=_vector("Control held over [k, k+1), absolute, in the model's units."),
+            j=_field("integer", "Sample the held command was computed from; null before the first.", nullable=True),
+            d=_field("integer", "True delay k - j, samples; null before the first command.", nullable=True),
+            w=_vector("Disturbance (gust) at sample k, in the model's units."),
+            delta=_field("number", "Uncertainty of the plant at sample k, no unit."),
+            timeout=_field("boolean", "The servo time-out holds the control at neutral."),
+        ),
+        "autopilot/command": _schema(
+            "Autopilot command",
+            "One command of the control law, Eq. (9), and the delay it was computed for.",
+            j=_field("integer", "Sample the command was computed from."),
+            sample_ns=_field("integer", "Stamp of that sample, ns, plant's clock."),
+            epoch=_field("integer", "Counts the plant's restarts; sample numbers compare within one epoch."),
+            x=_vector("State of sample j as received, absolute, in the model's units."),
+            xr=_vector("Reference state used in this command; null without a reference.", nullable=True),
+            r=_vector("Reference input at sample j; null without a reference.", nullable=True),
+            u=_vector("Commanded control after saturation, absolute, in the model's units."),
+            saturated=_field("boolean", "Some control reached its limit."),
+            d=_field("integer", "Forecast delay of this command, samples; null if unknown.", nullable=True),
+            d_low=_field("integer", "Least delay the forecast allows, samples; null if unknown.", nullable=True),
+            d_high=_field("integer", "Greatest delay the forecast allows, samples; null if unknown.", nullable=True),
+            status=_field("string", "Status of the delay estimate."),
+            mode=_field("string", "Mode of the failsafe."),
+        ),
+        "link/up": _link_schema("Link up", "from the plant to the autopilot"),
+        "link/down": _link_schema("Link down", "from the autopilot to the plant"),
+        "events": _schema(
+            "Events",
+            "Something that happened: a change of mode, a failsafe, a fault, a new epoch.",
+            kind=_field("string", "What it was: mode, failsafe, fault, epoch, gains, counters, and so on."),
+            node=_field("string", "Which node it happened in."),
+            text=_field("string", "One line for people."),
+            data=_field("object", "Details, depending on kind.", properties={}, additionalProperties=True),
+        ),
+    }
+)
+"""JSON Schema of each fixed topic; ``schema_of`` also knows ``mavlink/<port>``."""
+
+FRAME_SCHEMA = _schema(
+    "MAVLink datagram",
+    "One datagram at a port of a node.",
+    t_ns=_field("integer", "When it was sent or received, ns, node's clock."),
+    direction=_field("string", "Seen from the node.", enum=["sent", "received"]),
+    frame=_field("string", "The datagram's bytes.", contentEncoding="base64"),
+)
+"""JSON Schema of the topics ``mavlink/<port>``."""
+
+
+def is_topic(topic: str) -> bool:
+    """Return whether a recording knows the topic."""
+    return topic in SCHEMAS or _FRAME_TOPIC.fullmatch(topic) is not None
+
+
+def schema_of(topic: str) -> Mapping[str, Any]:
+    """Return the JSON Schema of a topic.
+
+    Raises
+    ------
+    ValueError
+        If the topic is unknown.
+    """
+    if not is_topic(topic):
+        raise ValueError(f"unknown topic {topic[:80]!r}; known are {', '.join(SCHEMAS)} and mavlink/<port>")
+    return SCHEMAS.get(topic, FRAME_SCHEMA)

@@ -1,0 +1,292 @@
+"""The UDP driver: one node, its sockets, the wall clock, one selector loop.
+
+Ports are served in the order given, control first, and a bounded number of datagrams of each per pass, so
+no port starves another or the node's deadlines. A peer that is not there is no error. A port that dials
+talks to its one peer; a port that listens latches the first address whose datagram it is told to accept,
+lets go of it after a silence, and counts strangers.
+"""
+
+from __future__ import annotations
+
+import select
+import socket
+from collections.abc import Callable, Sequence
+from time import perf_counter_ns  # noqa: TID251  a driver reads the clock; this one is common to all processes
+from typing import Protocol
+
+from autopilot.link.clock import NS_PER_S, Clock
+from autopilot.link.node import Node, Record
+from autopilot.link.record import frame_record
+from gains.table import InputError
+
+__all__ = ["Address", "RecordSink", "UdpDriver", "UdpPort", "dial", "listen", "parse_address", "true_ns"]
+
+MAX_PER_PASS = 32
+"""Datagrams of one port that one pass serves."""
+
+MAX_DATAGRAM = 65_535
+
+LATCH_SILENCE_NS = 3 * NS_PER_S
+"""A latched peer that has been silent for so long may be replaced: it may have restarted elsewhere."""
+
+MAX_WAIT_NS = NS_PER_S // 4
+"""Longest sleep, so that a request to stop is soon seen."""
+
+RECEIVE_BUFFER_BYTES = 1 << 20
+
+Address = tuple[str, int]
+
+
+def true_ns() -> int:
+    """Return true time as all processes on this machine see it, in ns since an arbitrary instant."""
+    return perf_counter_ns()
+
+
+def parse_address(text: str) -> Address:
+    """Return host and port of ``127.0.0.1:14600``, ``[::1]:14600``, or the same after ``udpout:`` or ``udpin:``.
+
+    Raises
+    ------
+    InputError
+        For anything else.
+    """
+    bare = text.removeprefix("udpout:").removeprefix("udpin:")
+    host, colon, port = bare.rpartition(":")
+    host = host.removeprefix("[").removesuffix("]")
+    if not colon or not host or not port.isascii() or not port.isdigit() or int(port) > 65_535:
+        raise InputError(f'address "{text}": expected HOST:PORT such as 127.0.0.1:14550')
+    return host, int(port)
+
+
+def _resolve(address: Address) -> tuple[socket.AddressFamily, Address]:
+    host, port = address
+    try:
+        found = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
+    except (OSError, UnicodeError) as error:
+        raise InputError(f"address {host}:{port}: cannot be resolved ({error})") from None
+    return found[0], (str(found[4][0]), int(found[4][1]))
+
+
+class UdpPort:
+    """One socket of a node; made by :func:`dial` or :func:`listen`.
+
+    Attributes
+    ----------
+    name : str
+        The node's name for it.
+    peer : Address or None
+        Whom it talks to; None until one is latched.
+    strangers : int
+        Datagrams of other senders, dropped.
+    unsent : int
+        Datagrams that could not be sent: no peer, or the system refused.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        sock: socket.socket,
+        peer: Address | None,
+        accept: Callable[[bytes], bool] | None,
+        *,
+        connected: bool,
+    ) -> None:
+        self.name = name
+        self.socket = sock
+        self.peer = peer
+        self.strangers = 0
+        self.unsent = 0
+        self._accept = accept
+        self._connected = connected
+        self._heard_ns: int | None = None
+
+    @property
+    def local(self) -> Address:
+        """The address it is bound to."""
+        name = self.socket.getsockname()
+        return str(name[0]), int(name[1])
+
+    def receive(self, now_ns: int) -> bytes | None:
+        """Return the next datagram of the peer, b"" for one that was dropped, None when there is none."""
+        try:
+            datagram, sender = self.socket.recvfrom(MAX_DATAGRAM)
+        except (ConnectionRefusedError, ConnectionResetError):
+            return b""  # an earlier datagram of ours found nobody: the peer is not there
+        except BlockingIOError:
+            return None
+        if not self._connected and not self._is_peer((sender[0], sender[1]), datagram, now_ns):
+            self.strangers += 1
+            return b""
+        self._heard_ns = now_ns
+        return datagram
+
+    def send(self, datagram: bytes) -> None:
+        """Send to the peer; count what cannot be sent."""
+        if self.peer is None:
+            self.unsent += 1
+            return
+        try:
+            if self._connected:
+                self.socket.send(datagram)
+            else:
+                self.socket.sendto(datagram, self.peer)
+        except OSError:
+            self.unsent += 1  # nobody listens there, or the send buffer is full: UDP loses it
+
+    def _is_peer(self, sender: Address, datagram: bytes, now_ns: int) -> bool:
+        if sender == self.peer:
+            return True
+        if self._accept is None:
+            return False
+        silent = self._heard_ns is None or now_ns - self._heard_ns > LATCH_SILENCE_NS
+        if not silent or not self._accept(datagram):
+            return False
+        self.peer = sender
+        return True
+
+
+def dial(name: str, address: Address) -> UdpPort:
+    """Return a port that talks to one address and hears nobody else.
+
+    Raises
+    ------
+    InputError
+        When the address cannot be resolved or reached.
+    """
+    family, resolved = _resolve(address)
+    sock = _socket(family)
+    try:
+        sock.connect(resolved)
+    except OSError as error:
+        sock.close()
+        raise InputError(f"address {address[0]}:{address[1]}: {error.strerror}") from None
+    return UdpPort(name, sock, resolved, None, connected=True)
+
+
+def listen(
+    name: str, address: Address, *, peer: Address | None = None, accept: Callable[[bytes], bool] | None = None
+) -> UdpPort:
+    """Return a bound port that talks to ``peer``, or else to the first sender of an accepted datagram.
+
+    Raises
+    ------
+    InputError
+        When the address is busy, not ours, or cannot be resolved.
+    """
+    family, resolved = _resolve(address)
+    sock = _socket(family)
+    try:
+        sock.bind(resolved)
+    except OSError as error:
+        sock.close()
+        raise InputError(f"address {address[0]}:{address[1]}: {error.strerror}") from None
+    fixed = _resolve(peer)[1] if peer is not None else None
+    return UdpPort(name, sock, fixed, accept if peer is None else None, connected=False)
+
+
+def _socket(family: socket.AddressFamily) -> socket.socket:
+    sock = socket.socket(family, socket.SOCK_DGRAM)
+    sock.setblocking(False)
+    sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
+    return sock
+
+
+class RecordSink(Protocol):
+    """Where a driver's records go."""
+
+    def write(self, record: Record, log_time_ns: int) -> None:
+        """Take a record and its true time, as :func:`true_ns` counts."""
+
+    def pump(self) -> None:
+        """Pass on what can be passed on without waiting."""
+
+
+class UdpDriver:
+    """Runs one node until told to stop.
+
+    Parameters
+    ----------
+    node : Node
+        The node.
+    ports : sequence of UdpPort
+        Control ports first.
+    clock : Clock
+        The node's clock; it boots when the driver is made.
+    sink : RecordSink, optional
+        Takes the records.
+    tap : bool
+        Whether datagrams are recorded too (``mavlink/<port>``).
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        ports: Sequence[UdpPort],
+        clock: Clock,
+        sink: RecordSink | None = None,
+        *,
+        tap: bool = False,
+    ) -> None:
+        self.node = node
+        self.clock = Clock(clock.offset_ns, clock.drift_ppb, true_ns())
+        self._ports = list(ports)
+        self._by_name = {port.name: port for port in ports}
+        self._sink = sink
+        self._tap = tap and sink is not None
+
+    def run(self, stopping: Callable[[], bool]) -> None:
+        """Serve the node until ``stopping()`` holds."""
+        while not stopping():
+            self._wait()
+            for port in self._ports:
+                self._serve(port)
+            now_ns = self._now_ns()
+            deadline_ns = self.node.next_deadline_ns()
+            if deadline_ns is not None and now_ns >= deadline_ns:
+                self.node.tick(now_ns)
+            self._flush()
+            if self._sink is not None:
+                self._sink.pump()
+
+    def close(self) -> None:
+        """Close the sockets."""
+        for port in self._ports:
+            port.socket.close()
+
+    def _now_ns(self) -> int:
+        return self.clock.node_ns(true_ns())
+
+    def _wait(self) -> None:
+        """Sleep until a datagram comes or the node's deadline, whichever is first."""
+        deadline_ns = self.node.next_deadline_ns()
+        wait_ns = MAX_WAIT_NS
+        if deadline_ns is not None:
+            wait_ns = min(wait_ns, max(0, self.clock.true_ns(deadline_ns) - true_ns()))
+        select.select([port.socket for port in self._ports], [], [], wait_ns / NS_PER_S)
+
+    def _serve(self, port: UdpPort) -> None:
+        """Hand the node a bounded number of datagrams, sending its answers at once."""
+        for _ in range(MAX_PER_PASS):
+            at_ns = true_ns()
+            datagram = port.receive(at_ns)
+            if datagram is None:
+                return
+            if not datagram:
+                continue
+            now_ns = self.clock.node_ns(at_ns)
+            if self._tap and self._sink is not None:
+                self._sink.write(frame_record(port.name, now_ns, "received", datagram), at_ns)
+            self.node.receive(port.name, datagram, now_ns)
+            self._flush()
+
+    def _flush(self) -> None:
+        """Send and record what the node has made."""
+        for name, datagram in self.node.outgoing():
+            self._by_name[name].send(datagram)
+            if self._tap and self._sink is not None:
+                at_ns = true_ns()
+                record = frame_record(name, self.clock.node_ns(at_ns), "sent", datagram)
+                self._sink.write(record, at_ns)
+        for record in self.node.records():
+            if self._sink is not None:
+                self._sink.write(record, self.clock.true_ns(record.t_ns))

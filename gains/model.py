@@ -1,0 +1,296 @@
+"""Models of the aircraft and the gains that fly it: Eqs. (4), (6), (8) and (9).
+
+    x(k+1) = A x(k) + B u(k) + E w(k),   y(k) = C x(k) + D u(k)
+    xr(k+1) = Ar xr(k) + Br r(k),        yr(k) = Cr xr(k)
+    u(k) = K1 x(k − d(k)) + K2 xr(k)
+
+States, inputs and outputs are deviations from trim. All arrays are read-only float64.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.linalg import expm
+
+__all__ = [
+    "Actuator",
+    "Condition",
+    "Gains",
+    "Matrix",
+    "Model",
+    "Reference",
+    "Trim",
+    "Uncertainty",
+    "read_only",
+    "spectral_radius",
+    "zero_order_hold",
+]
+
+Matrix = NDArray[np.float64]
+
+
+def read_only(array: ArrayLike) -> Matrix:
+    """Return a contiguous float64 copy that cannot be written."""
+    copy = np.array(array, dtype=np.float64, order="C")
+    copy.flags.writeable = False
+    return copy
+
+
+def _freeze(instance: object) -> None:
+    """Make every array of a frozen dataclass read-only, so that no holder can change it for another."""
+    for entry in fields(instance):  # type: ignore[arg-type]  # called from dataclasses only
+        value = getattr(instance, entry.name)
+        if isinstance(value, np.ndarray):
+            object.__setattr__(instance, entry.name, read_only(value))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Trim:
+    """The absolute values that deviations are counted from.
+
+    Attributes
+    ----------
+    x : ndarray, shape (nx,)
+        State at trim, in the units of the states.
+    u : ndarray, shape (nu,)
+        Input at trim, in the units of the inputs; the neutral position of the actuator.
+    """
+
+    x: Matrix
+    u: Matrix
+
+    def __post_init__(self) -> None:
+        _freeze(self)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Actuator:
+    """Limits and lag of the actuator; None where there is none. ``low`` and ``high`` come together.
+
+    Attributes
+    ----------
+    low, high : ndarray or None, shape (nu,)
+        Travel, absolute, in units of u.
+    rate : ndarray or None, shape (nu,)
+        Largest speed, in units of u per second.
+    tau : ndarray or None, shape (nu,)
+        Time constant of a first-order lag, seconds.
+    """
+
+    low: Matrix | None = None
+    high: Matrix | None = None
+    rate: Matrix | None = None
+    tau: Matrix | None = None
+
+    def __post_init__(self) -> None:
+        assert (self.low is None) == (self.high is None)
+        _freeze(self)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Reference:
+    """The reference model xr(k+1) = Ar xr(k) + Br r(k), yr = Cr xr (8), discrete at the model's Ts.
+
+    Attributes
+    ----------
+    Ar : ndarray, shape (nr, nr)
+        Schur: spectral radius below 1.
+    Br : ndarray, shape (nr, number of reference inputs)
+    Cr : ndarray, shape (ny, nr)
+    """
+
+    Ar: Matrix
+    Br: Matrix
+    Cr: Matrix
+
+    def __post_init__(self) -> None:
+        _freeze(self)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Uncertainty:
+    """Norm-bounded uncertainty [ΔA ΔB] = F Δ(k) [J1 J2], ‖Δ(k)‖ ≤ delta_max (6), (7), discrete at Ts.
+
+    Attributes
+    ----------
+    F : ndarray, shape (nx, rows of Δ)
+    J1 : ndarray, shape (columns of Δ, nx)
+    J2 : ndarray, shape (columns of Δ, nu)
+    delta_max : float
+        Bound on the spectral norm of Δ; the paper scales F so that it is 1.
+    """
+
+    F: Matrix
+    J1: Matrix
+    J2: Matrix
+    delta_max: float
+
+    def __post_init__(self) -> None:
+        _freeze(self)
+
+
+@dataclass(frozen=True, slots=True)
+class Condition:
+    """The flight condition a model was linearised at; for display.
+
+    Attributes
+    ----------
+    airspeed_m_s : float
+        True airspeed.
+    altitude_m : float
+        Pressure altitude.
+    """
+
+    airspeed_m_s: float
+    altitude_m: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Model:
+    """A linear aircraft sampled at Ts, Eq. (4), with what is needed to fly it.
+
+    Attributes
+    ----------
+    name : str
+    Ts : float
+        Sampling period, seconds.
+    A : ndarray, shape (nx, nx)
+    B : ndarray, shape (nx, nu)
+    E : ndarray, shape (nx, nw)
+        Disturbance input; nw = 0 where the file has none.
+    C : ndarray, shape (ny, nx)
+    D : ndarray, shape (ny, nu)
+    states : tuple of str, length nx
+        Names of the states, with units; their order is that of x.
+    trim : Trim
+    actuator : Actuator or None
+    sensors : Mapping[str, str]
+        State name to the MAVLink field that carries it, "MESSAGE.field"; all states, or empty.
+    reference : Reference or None
+    uncertainty : Uncertainty or None
+    condition : Condition or None
+    """
+
+    name: str
+    Ts: float
+    A: Matrix
+    B: Matrix
+    E: Matrix
+    C: Matrix
+    D: Matrix
+    states: tuple[str, ...]
+    trim: Trim
+    actuator: Actuator | None = None
+    sensors: Mapping[str, str] = field(default_factory=dict)
+    reference: Reference | None = None
+    uncertainty: Uncertainty | None = None
+    condition: Condition | None = None
+
+    def __post_init__(self) -> None:
+        _freeze(self)
+        nx, nu, ny = self.nx, self.nu, self.ny
+        shapes = [array.shape for array in (self.A, self.B, self.E, self.C, self.D)]
+        assert shapes == [(nx, nx), (nx, nu), (nx, self.nw), (ny, nx), (ny, nu)], shapes
+        assert (len(self.states), self.trim.x.shape, self.trim.u.shape) == (nx, (nx,), (nu,))
+        assert not self.sensors or set(self.sensors) == set(self.states)
+
+    @property
+    def Ts_ns(self) -> int:
+        """Sampling period in nanoseconds."""
+        return round(self.Ts * 1e9)
+
+    @property
+    def nx(self) -> int:
+        """Number of states."""
+        return int(self.A.shape[0])
+
+    @property
+    def nu(self) -> int:
+        """Number of inputs."""
+        return int(self.B.shape[1])
+
+    @property
+    def ny(self) -> int:
+        """Number of outputs."""
+        return int(self.C.shape[0])
+
+    @property
+    def nw(self) -> int:
+        """Number of disturbances."""
+        return int(self.E.shape[1])
+
+    @property
+    def nr(self) -> int:
+        """Number of states of the reference model; 0 without one."""
+        return 0 if self.reference is None else int(self.reference.Ar.shape[0])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Gains:
+    """The law u(k) = K1 x(k − d(k)) + K2 xr(k), Eq. (9), and the delays it may be used at.
+
+    Attributes
+    ----------
+    name : str
+    model : Model
+    d_min, d_max : int
+        The window of delays, samples.
+    K1 : ndarray, shape (nu, nx)
+    K2 : ndarray or None, shape (nu, nr)
+        None where the model has no reference.
+    certificate : Mapping[str, object] or None
+        The file's table as it is: nothing here has been verified.
+    """
+
+    name: str
+    model: Model
+    d_min: int
+    d_max: int
+    K1: Matrix
+    K2: Matrix | None = None
+    certificate: Mapping[str, object] | None = None
+
+    def __post_init__(self) -> None:
+        _freeze(self)
+        assert 0 <= self.d_min <= self.d_max
+        assert self.K1.shape == (self.model.nu, self.model.nx)
+        assert (self.K2 is None) == (self.model.reference is None)
+        assert self.K2 is None or self.K2.shape == (self.model.nu, self.model.nr)
+
+
+def zero_order_hold(Ap: Matrix, Bp: Matrix, Ts: float) -> tuple[Matrix, Matrix]:
+    """Return A = e^{Ap Ts} and B = ∫₀^Ts e^{Ap s} ds Bp.
+
+    Both come from one exponential, exp([[Ap, I], [0, 0]] Ts) = [[A, ∫₀^Ts e^{Ap s} ds], [0, I]]; Bp stays
+    outside, so that its size does not spoil the scaling. Several inputs are held at once by their columns:
+    ``zero_order_hold(Ap, np.hstack([Bp, Ep]), Ts)``.
+
+    Parameters
+    ----------
+    Ap : ndarray, shape (nx, nx)
+        Per second.
+    Bp : ndarray, shape (nx, m)
+        Per second; m may be 0.
+    Ts : float
+        Sampling period, seconds.
+
+    Returns
+    -------
+    A : ndarray, shape (nx, nx)
+    B : ndarray, shape (nx, m)
+    """
+    nx = Ap.shape[0]
+    block = np.zeros((2 * nx, 2 * nx))
+    block[:nx, :nx] = Ap
+    block[:nx, nx:] = np.eye(nx)
+    held = np.asarray(expm(block * Ts), dtype=np.float64)
+    return held[:nx, :nx].copy(), held[:nx, nx:] @ Bp
+
+
+def spectral_radius(matrix: Matrix) -> float:
+    """Return max |λ| over the eigenvalues of a square matrix; below 1 means Schur."""
+    return float(np.max(np.abs(np.linalg.eigvals(matrix))))

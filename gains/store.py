@@ -1,0 +1,278 @@
+"""Model and gain files: find by name or path, read, check every field and shape.
+
+A name that :func:`stored` lists stands for the file that comes with the program; anything else is a path.
+The quantities of [reference] and [uncertainty] are discrete at Ts, also where the plant is continuous.
+"""
+
+from __future__ import annotations
+
+import difflib
+import re
+from importlib import resources
+from pathlib import Path
+from typing import Literal, NamedTuple
+
+import numpy as np
+
+from gains.model import (
+    Actuator,
+    Condition,
+    Gains,
+    Matrix,
+    Model,
+    Reference,
+    Trim,
+    Uncertainty,
+    spectral_radius,
+    zero_order_hold,
+)
+from gains.table import InputError, Table, describe
+
+__all__ = [
+    "DELAY_LIMIT",
+    "Stored",
+    "load",
+    "load_gains",
+    "load_model",
+    "parse_gains",
+    "parse_model",
+    "resolve",
+    "stored",
+]
+
+TS_MIN_S, TS_MAX_S = 1e-6, 3600.0
+DELAY_LIMIT = 1000  # samples; buffers in the loop grow with d_max
+_SENSOR = re.compile(r"[A-Z][A-Z0-9_]*\.[A-Za-z][A-Za-z0-9_]*")
+
+Kind = Literal["model", "gains"]
+
+
+class Stored(NamedTuple):
+    """A file that comes with the program."""
+
+    name: str
+    kind: Kind
+    path: Path
+
+
+def stored() -> list[Stored]:
+    """Return the stored models and gains, models first, each sorted by name."""
+    entries = [Stored(name, _kind(Table.load(path)), path) for name, path in _stored_paths().items()]
+    return sorted(entries, key=lambda entry: (entry.kind != "model", entry.name))
+
+
+def resolve(name_or_path: str | Path, folder: Path | None = None) -> Path:
+    """Return the file that a stored name or a path stands for; relative paths start at ``folder``.
+
+    Raises
+    ------
+    InputError
+        When it is neither, naming the nearest stored name.
+    """
+    paths = _stored_paths()
+    name = str(name_or_path)
+    if name in paths:
+        return paths[name]
+    path = Path(name_or_path) if folder is None else folder / name_or_path
+    try:
+        found = path.exists()
+    except (OSError, ValueError):
+        found = True  # opening it will tell what is wrong
+    if not found:
+        near = difflib.get_close_matches(name, paths, 1)
+        hint = f"; did you mean {near[0]}?" if near else ""
+        raise InputError(f"{name}: expected a stored name or a file, found neither{hint}")
+    return path
+
+
+def load_model(name_or_path: str | Path) -> Model:
+    """Return the model of a file, discrete at its Ts.
+
+    Raises
+    ------
+    InputError
+        Naming the file, the field, what was expected and what was found.
+    """
+    return parse_model(Table.load(resolve(name_or_path)))
+
+
+def load_gains(name_or_path: str | Path) -> Gains:
+    """Return the gains of a file together with the model it names.
+
+    Raises
+    ------
+    InputError
+        Naming the file, the field, what was expected and what was found.
+    """
+    return parse_gains(Table.load(resolve(name_or_path)))
+
+
+def load(name_or_path: str | Path) -> Model | Gains:
+    """Return the model or the gains of a file, whichever it holds."""
+    table = Table.load(resolve(name_or_path))
+    return parse_model(table) if _kind(table) == "model" else parse_gains(table)
+
+
+def parse_model(table: Table) -> Model:
+    """Return the model that the table of a whole file describes."""
+    if _kind(table) != "model":
+        raise InputError(f"{table.source}: expected a model file ([plant]), found a gain file")
+    name = table.string("name")
+    Ts = table.number("Ts", low=TS_MIN_S, high=TS_MAX_S)
+    plant = table.table("plant")
+    A, B, E, C, D = _plant(plant, Ts)
+    nx, nu = B.shape
+    states = plant.strings("states", length=nx)
+    if len(set(states)) != nx:
+        raise plant.error("states", "distinct names", f"{max(states, key=states.count)} twice")
+    actuator = _actuator(table.table("actuator", None), nu)
+    model = Model(
+        name=name,
+        Ts=Ts,
+        A=A,
+        B=B,
+        E=E,
+        C=C,
+        D=D,
+        states=states,
+        trim=_trim(table.table("trim", None), nx, nu, actuator, table.source),
+        actuator=actuator,
+        sensors=_sensors(table.table("sensors", None), states),
+        reference=_reference(table.table("reference", None), C.shape[0]),
+        uncertainty=_uncertainty(table.table("uncertainty", None), nx, nu),
+        condition=_condition(table.table("condition", None)),
+    )
+    table.finish()
+    return model
+
+
+def parse_gains(table: Table) -> Gains:
+    """Return the gains that the table of a whole file describes, with their model."""
+    if _kind(table) != "gains":
+        raise InputError(f"{table.source}: expected a gain file (model, K1), found a model file")
+    if "window" in table:
+        raise table.error("window", "K1 and K2", "a schedule; schedules are not supported by this version")
+    name = table.string("name")
+    reference = table.string("model")
+    try:
+        path = resolve(reference, table.folder)
+    except InputError as error:
+        raise InputError(f"{table.source}: model: {error}") from None
+    model = parse_model(Table.load(path))
+    d_min = table.integer("d_min", low=0, high=DELAY_LIMIT)
+    d_max = table.integer("d_max", low=d_min, high=DELAY_LIMIT)
+    K1 = table.matrix("K1", shape=(model.nu, model.nx))
+    K2: Matrix | None = None
+    if model.reference is not None:
+        K2 = table.matrix("K2", shape=(model.nu, model.nr))
+    elif "K2" in table:
+        raise table.error("K2", f"none, as model {model.name} has no [reference]", "one")
+    certificate = table.mapping("certificate", None)
+    table.finish()
+    return Gains(name, model, d_min, d_max, K1, K2, certificate)
+
+
+def _stored_paths() -> dict[str, Path]:
+    folder = Path(str(resources.files("gains") / "stored"))
+    return {path.stem: path for path in sorted(folder.glob("*.toml"))}
+
+
+def _kind(table: Table) -> Kind:
+    """Tell a model from gains by the keys that only one of them has; what has none is read as a model."""
+    is_gains = "plant" not in table and any(key in table for key in ("model", "K1", "window"))
+    return "gains" if is_gains else "model"
+
+
+def _plant(plant: Table, Ts: float) -> tuple[Matrix, Matrix, Matrix, Matrix, Matrix]:
+    """Return A, B, E, C, D at Ts."""
+    continuous = plant.boolean("continuous")
+    A = plant.matrix("A")
+    nx = A.shape[0]
+    if A.shape[1] != nx:
+        raise plant.error("A", "a square matrix", f"{nx} by {A.shape[1]}")
+    B = plant.matrix("B", shape=(nx, None))
+    E = plant.matrix("E", np.zeros((nx, 0)), shape=(nx, None))
+    C = plant.matrix("C", np.eye(nx), shape=(None, nx))
+    D = plant.matrix("D", np.zeros((C.shape[0], B.shape[1])), shape=(C.shape[0], B.shape[1]))
+    if continuous:
+        with np.errstate(all="ignore"):
+            A, held = zero_order_hold(A, np.hstack([B, E]), Ts)
+        if not (np.isfinite(A).all() and np.isfinite(held).all()):
+            raise plant.error("A", f"a finite zero-order hold at Ts = {Ts:g} s", "an overflow")
+        B, E = held[:, : B.shape[1]], held[:, B.shape[1] :]
+    return A, B, E, C, D
+
+
+def _actuator(table: Table | None, nu: int) -> Actuator | None:
+    if table is None:
+        return None
+    low = high = None
+    if "low" in table or "high" in table:
+        low = table.vector("low", length=nu)
+        high = table.vector("high", length=nu)
+        for i in range(nu):
+            if low[i] >= high[i]:
+                raise table.error("high", f"a number above low ({low[i]:g})", f"{high[i]:g}", at=f"[{i}]")
+    rate = table.vector("rate", None, length=nu, above=0.0)
+    tau = table.vector("tau", None, length=nu, low=0.0)
+    return Actuator(low, high, rate, tau)
+
+
+def _trim(table: Table | None, nx: int, nu: int, actuator: Actuator | None, source: str) -> Trim:
+    x, u = np.zeros(nx), np.zeros(nu)
+    if table is not None:
+        x, u = table.vector("x", x, length=nx), table.vector("u", u, length=nu)
+    if actuator is not None and actuator.low is not None and actuator.high is not None:
+        for i in range(nu):
+            low, high = actuator.low[i], actuator.high[i]
+            if not low <= u[i] <= high:
+                expected = f"a number in the travel of [actuator], {low:g} to {high:g}"
+                raise InputError(f"{source}: trim.u[{i}]: expected {expected}, found {u[i]:g}")
+    return Trim(x, u)
+
+
+def _sensors(table: Table | None, states: tuple[str, ...]) -> dict[str, str]:
+    if table is None:
+        return {}
+    for name in table:
+        if name not in states:
+            near = difflib.get_close_matches(name, states, 1)
+            hint = f"; did you mean {near[0]}?" if near else ""
+            raise table.error(name, f"a state ({', '.join(states)})", f"an unknown name{hint}")
+    expected = "MESSAGE.field, such as ATTITUDE.pitch"
+    sensors: dict[str, str] = {}
+    for state in states:
+        if state not in table:
+            raise table.error(state, expected, "nothing")
+        sensors[state] = table.string(state)
+        if not _SENSOR.fullmatch(sensors[state]):
+            raise table.error(state, expected, describe(sensors[state]))
+    return sensors
+
+
+def _reference(table: Table | None, ny: int) -> Reference | None:
+    if table is None:
+        return None
+    Ar = table.matrix("Ar")
+    nr = Ar.shape[0]
+    if Ar.shape[1] != nr:
+        raise table.error("Ar", "a square matrix", f"{nr} by {Ar.shape[1]}")
+    radius = spectral_radius(Ar)
+    if not radius < 1.0:
+        raise table.error("Ar", "a Schur matrix (spectral radius below 1)", f"spectral radius {radius:.9g}")
+    return Reference(Ar, table.matrix("Br", shape=(nr, None)), table.matrix("Cr", shape=(ny, nr)))
+
+
+def _uncertainty(table: Table | None, nx: int, nu: int) -> Uncertainty | None:
+    if table is None:
+        return None
+    F = table.matrix("F", shape=(nx, None))
+    J1 = table.matrix("J1", shape=(None, nx))
+    J2 = table.matrix("J2", shape=(J1.shape[0], nu))
+    return Uncertainty(F, J1, J2, table.number("delta_max", low=0.0))
+
+
+def _condition(table: Table | None) -> Condition | None:
+    if table is None:
+        return None
+    return Condition(table.number("airspeed_m_s", above=0.0), table.number("altitude_m"))

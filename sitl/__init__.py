@@ -1,0 +1,1 @@
+"""SITL: the world around the autopilot: aircraft, link, scenarios, recordings."""

@@ -1,0 +1,295 @@
+"""A flight as data: what flies, over which link, for how long, and the checks that decide its outcome.
+
+Scenarios are TOML files, stored ones by name. This module alone knows all three nodes: it builds them
+from a scenario, for either driver, and writes the command lines that build the same ones elsewhere.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from importlib import resources
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from autopilot.app import AutopilotConfig, AutopilotNode
+from autopilot.link.clock import Clock
+from autopilot.link.process import format_clock, parse_clock
+from autopilot.reference import parse_profile
+from gains.model import Gains, Model
+from gains.store import load_gains, load_model
+from gains.table import InputError, Table
+from sitl.aircraft.disturbance import HarmonicGust, SquareDelta
+from sitl.impairment import LinkSpec, format_spec, parse_link
+from sitl.plant import PlantConfig, PlantNode
+from sitl.relay import RelayNode
+
+__all__ = [
+    "Check",
+    "Scenario",
+    "autopilot_arguments",
+    "load_scenario",
+    "plant_arguments",
+    "relay_arguments",
+    "stored_scenarios",
+]
+
+DEFAULT_CLOCKS: Mapping[str, str] = {
+    "plant": "137s:+40ppm",
+    "relay": "11s:-20ppm",
+    "autopilot": "1042s:-60ppm",
+}
+"""No two clocks agree unless a scenario says so: mixed-up clocks fail at once."""
+
+SERVO_TIMEOUT_MARGIN = 5
+"""The plant's servo time-out is d_max and this many samples, unless a scenario says otherwise."""
+
+
+@dataclass(frozen=True, slots=True)
+class Check:
+    """A bound on a number of the summary, or a text that it must be.
+
+    Attributes
+    ----------
+    name : str
+        What is claimed.
+    metric : str
+        Dotted path into the summary, for example ``delay.within_one_fraction``.
+    at_most, at_least : float or None
+        Inclusive bounds.
+    equals : str or None
+        The text that is wanted.
+    """
+
+    name: str
+    metric: str
+    at_most: float | None = None
+    at_least: float | None = None
+    equals: str | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Scenario:
+    """One flight.
+
+    Attributes
+    ----------
+    name, title : str
+        Short and long name.
+    gains_name, plant_name : str
+        What the gains and the plant were loaded from: stored names or paths.
+    gains : Gains
+        What flies, on the model it was designed for.
+    plant : Model
+        What is flown, as a rule that same model.
+    duration_s : float
+        Length from k = 0.
+    seed : int
+        Of everything random.
+    reference : str
+        Programmed reference (:func:`autopilot.reference.parse_profile`).
+    up, down : LinkSpec
+        Plant to autopilot, and back.
+    clocks : mapping
+        Node name to Clock.
+    actuator, failsafe, latch
+        As the programs take them.
+    servo_timeout : int or None
+        Samples, None for never.
+    x0 : (nx,) array or None
+        State at k = 0.
+    gust : HarmonicGust or None
+        Eq. (52).
+    delta : SquareDelta or None
+        Eq. (51).
+    checks : tuple of Check
+        What must hold at the end.
+    variants : mapping
+        Name to the same scenario with one thing changed, flown beside it in virtual time to compare.
+    """
+
+    name: str
+    title: str
+    gains_name: str
+    plant_name: str
+    gains: Gains
+    plant: Model
+    duration_s: float
+    seed: int
+    reference: str
+    up: LinkSpec
+    down: LinkSpec
+    clocks: Mapping[str, Clock]
+    actuator: Literal["pwm", "float"] = "pwm"
+    failsafe: Literal["on", "monitor"] = "on"
+    latch: Literal["newest", "last"] = "newest"
+    servo_timeout: int | None = None
+    x0: NDArray[np.float64] | None = None
+    gust: HarmonicGust | None = None
+    delta: SquareDelta | None = None
+    checks: tuple[Check, ...] = ()
+    variants: Mapping[str, Scenario] = field(default_factory=dict)
+
+    @property
+    def samples(self) -> int:
+        """Number of samples to fly."""
+        return max(1, round(self.duration_s / self.plant.Ts))
+
+    def plant_node(self) -> PlantNode:
+        """Return the plant, new."""
+        return PlantNode(PlantConfig(self.plant, self.x0, self.gust, self.delta, self.latch, self.servo_timeout))
+
+    def relay_node(self) -> RelayNode:
+        """Return the relay, new."""
+        return RelayNode(self.up, self.down, self.seed)
+
+    def autopilot_node(self, ground_stations: int) -> AutopilotNode:
+        """Return the autopilot, new."""
+        profile = parse_profile(self.reference, self.gains.model.Ts)
+        return AutopilotNode(
+            AutopilotConfig(self.gains, profile, self.actuator, self.failsafe, ground_stations=ground_stations)
+        )
+
+
+def stored_scenarios() -> dict[str, Path]:
+    """Return name and file of each stored scenario."""
+    folder = resources.files("sitl") / "scenarios"
+    paths = sorted(Path(str(entry)) for entry in folder.iterdir() if entry.name.endswith(".toml"))
+    return {path.stem: path for path in paths}
+
+
+def load_scenario(name_or_path: str, *, gains: str | None = None, plant: str | None = None) -> Scenario:
+    """Return a stored scenario, or one from a file, optionally with other gains or another plant.
+
+    Raises
+    ------
+    InputError
+        When there is none, or it is not well formed.
+    """
+    stored = stored_scenarios()
+    path = stored.get(name_or_path, Path(name_or_path))
+    if name_or_path not in stored and not path.is_file():
+        known = ", ".join(stored)
+        raise InputError(f'scenario "{name_or_path}": expected one of {known}, or a file')
+    table = Table.load(path)
+    scenario = _parse(table, path.stem, gains, plant)
+    table.finish()
+    return scenario
+
+
+def _parse(table: Table, name: str, gains_name: str | None, plant_name: str | None) -> Scenario:
+    file_gains, file_plant = table.string("gains"), table.string("plant")
+    gains_name, plant_name = gains_name or file_gains, plant_name or file_plant
+    gains, plant = load_gains(gains_name), load_model(plant_name)
+    _check_fit(gains, plant)
+    link = table.table("link", default=None)
+    up, down = parse_link(*((link.string(key, default=None) if link else None) for key in ("preset", "up", "down")))
+    clocks = table.table("clocks", default=None)
+    scenario = Scenario(
+        name=name,
+        title=table.string("title"),
+        gains_name=gains_name,
+        plant_name=plant_name,
+        gains=gains,
+        plant=plant,
+        duration_s=table.number("duration_s", above=0.0, high=86_400.0),
+        seed=table.integer("seed", default=1, low=0),
+        reference=table.string("reference", default=""),
+        up=up,
+        down=down,
+        clocks={
+            node: parse_clock(clocks.string(node, default=text) if clocks else text)
+            for node, text in DEFAULT_CLOCKS.items()
+        },
+        servo_timeout=_servo_timeout(table, gains),
+        x0=table.vector("x0", length=plant.nx, default=None),
+        gust=_gust(table, plant),
+        delta=_delta(table, plant),
+        checks=tuple(_check(t) for t in table.tables("check", default=())),
+    )
+    parse_profile(scenario.reference, gains.model.Ts)
+    variants = table.table("variant", default=None)
+    if variants is None:
+        return scenario
+    return replace(scenario, variants={v: _variant(scenario, variants.table(v)) for v in variants})
+
+
+def _check_fit(gains: Gains, plant: Model) -> None:
+    """Refuse a plant that the gains' state or sampling does not describe."""
+    if plant.states != gains.model.states or plant.Ts_ns != gains.model.Ts_ns:
+        raise InputError(
+            f"gains {gains.name}: expected a plant with states {', '.join(gains.model.states)} at Ts"
+            f" {gains.model.Ts} s, found {plant.name} with {', '.join(plant.states)} at {plant.Ts} s"
+        )
+
+
+def _servo_timeout(table: Table, gains: Gains) -> int | None:
+    samples: int = table.integer("servo_timeout", default=gains.d_max + SERVO_TIMEOUT_MARGIN, low=0)
+    return samples or None
+
+
+def _gust(table: Table, plant: Model) -> HarmonicGust | None:
+    gust = table.table("gust", default=None)
+    if gust is None:
+        return None
+    start_k = round(gust.number("start_s", default=0.0, low=0.0) / plant.Ts)
+    if plant.nw == 0:
+        raise table.error("gust", "a plant with a disturbance input E", f"{plant.name} without")
+    return HarmonicGust(plant.nw, start_k)
+
+
+def _delta(table: Table, plant: Model) -> SquareDelta | None:
+    delta = table.table("uncertainty", default=None)
+    if delta is None:
+        return None
+    if plant.uncertainty is None:
+        raise table.error("uncertainty", "a plant with [uncertainty]", f"{plant.name} without")
+    return SquareDelta(delta.number("amplitude", default=0.15), delta.integer("half_period", default=20, low=1))
+
+
+def _check(table: Table) -> Check:
+    check = Check(
+        table.string("name"),
+        table.string("metric"),
+        table.number("at_most", default=None),
+        table.number("at_least", default=None),
+        table.string("equals", default=None),
+    )
+    if check.at_most is None and check.at_least is None and check.equals is None:
+        raise table.error("at_most", "at_most, at_least or equals", "none")
+    return check
+
+
+def _variant(scenario: Scenario, table: Table) -> Scenario:
+    """Return the scenario with what the variant's table changes."""
+    return replace(scenario, servo_timeout=_servo_timeout(table, scenario.gains), checks=())
+
+
+def plant_arguments(scenario: Scenario) -> list[str]:
+    """Return the options with which ``sitl plant`` builds the scenario's plant."""
+    arguments = ["--plant", scenario.plant_name, "--latch", scenario.latch]
+    arguments += ["--servo-timeout", str(scenario.servo_timeout or 0)]
+    arguments += ["--clock", format_clock(scenario.clocks["plant"])]
+    if scenario.x0 is not None:
+        arguments += ["--x0", ",".join(repr(value) for value in scenario.x0.tolist())]
+    if scenario.gust is not None:
+        arguments += ["--gust", repr(scenario.gust.start_k * scenario.plant.Ts)]
+    if scenario.delta is not None:
+        arguments += ["--uncertainty", f"{scenario.delta.amplitude!r}:{scenario.delta.half_period}"]
+    return arguments
+
+
+def relay_arguments(scenario: Scenario) -> list[str]:
+    """Return the options with which ``sitl relay`` builds the scenario's link."""
+    arguments = ["--up", format_spec(scenario.up), "--down", format_spec(scenario.down)]
+    return [*arguments, "--seed", str(scenario.seed), "--clock", format_clock(scenario.clocks["relay"])]
+
+
+def autopilot_arguments(scenario: Scenario) -> list[str]:
+    """Return the options with which ``autopilot`` builds the scenario's autopilot."""
+    arguments = ["--gains", scenario.gains_name, "--actuator", scenario.actuator]
+    arguments += ["--failsafe", scenario.failsafe, "--clock", format_clock(scenario.clocks["autopilot"])]
+    return [*arguments, "--reference", scenario.reference] if scenario.reference else arguments

@@ -1,0 +1,353 @@
+"""Model and gain files: what is stored, what is refused and in which words."""
+
+import contextlib
+import copy
+import tomllib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gains.model import Gains, Model
+from gains.store import (
+    DELAY_LIMIT,
+    load,
+    load_gains,
+    load_model,
+    parse_gains,
+    parse_model,
+    resolve,
+    stored,
+)
+from gains.table import InputError, Table
+
+MODEL: dict[str, Any] = {
+    "name": "m",
+    "Ts": 0.025,
+    "plant": {
+        "continuous": False,
+        "A": [[0.9, 0.1], [0.0, 1.0]],
+        "B": [[0.0], [1.0]],
+        "E": [[1.0], [0.0]],
+        "C": [[1.0, 0.0]],
+        "D": [[0.5]],
+        "states": ["a_rad", "b_rad_s"],
+    },
+    "trim": {"x": [0.1, 0.0], "u": [0.2]},
+    "actuator": {"low": [-1.0], "high": [1.0], "rate": [2.0], "tau": [0.0]},
+    "sensors": {"a_rad": "ATTITUDE.pitch", "b_rad_s": "ATTITUDE.pitchspeed"},
+    "reference": {"Ar": [[0.5]], "Br": [[0.5]], "Cr": [[1.0]]},
+    "uncertainty": {"F": [[1.0], [0.0]], "J1": [[0.1, 0.2]], "J2": [[0.3]], "delta_max": 0.15},
+    "condition": {"airspeed_m_s": 100.0, "altitude_m": -10.0},
+}
+GAINS: dict[str, Any] = {
+    "name": "g",
+    "model": "hirm",
+    "d_min": 1,
+    "d_max": 4,
+    "K1": [[1.0, 2.0, 3.0]],
+    "K2": [[1.0, 2.0, 3.0]],
+}
+GONE = object()
+
+
+def changed(base: dict[str, Any], field: str, value: object) -> dict[str, Any]:
+    """A deep copy with one field, "plant.A", set or removed."""
+    result = copy.deepcopy(base)
+    *folders, key = field.split(".")
+    inner = result
+    for folder in folders:
+        inner = inner[folder]
+    if value is GONE:
+        del inner[key]
+    else:
+        inner[key] = value
+    return result
+
+
+def complaint_of(read: Callable[[Table], object], data: dict[str, Any]) -> str:
+    with pytest.raises(InputError) as caught:
+        read(Table(data, "f.toml"))
+    return str(caught.value)
+
+
+def test_a_model_is_read_as_written() -> None:
+    model = parse_model(Table(copy.deepcopy(MODEL), "f.toml"))
+    assert (model.name, model.Ts, model.Ts_ns) == ("m", 0.025, 25_000_000)
+    assert (model.nx, model.nu, model.ny, model.nw, model.nr) == (2, 1, 1, 1, 1)
+    for name in "ABECD":
+        assert getattr(model, name).tolist() == MODEL["plant"][name]
+    assert model.states == ("a_rad", "b_rad_s")
+    assert model.trim.x.tolist() == [0.1, 0.0]
+    assert model.actuator is not None
+    assert model.actuator.rate is not None
+    assert model.actuator.rate.tolist() == [2.0]
+    assert model.sensors == MODEL["sensors"]
+    assert model.uncertainty is not None
+    assert model.uncertainty.delta_max == 0.15
+    assert model.condition is not None
+    assert model.condition.airspeed_m_s == 100.0
+
+
+def test_what_a_model_leaves_out_gets_the_documented_default() -> None:
+    plant = {key: MODEL["plant"][key] for key in ("continuous", "A", "B", "states")}
+    model = parse_model(Table({"name": "m", "Ts": 0.1, "plant": plant}, "f.toml"))
+    assert model.E.shape == (2, 0)
+    assert model.C.tolist() == [[1.0, 0.0], [0.0, 1.0]]
+    assert model.D.tolist() == [[0.0], [0.0]]
+    assert (model.trim.x == 0.0).all()
+    assert (model.trim.u == 0.0).all()
+    assert [model.actuator, model.reference, model.uncertainty, model.condition] == [None] * 4
+    assert model.sensors == {}
+
+
+def test_only_the_plant_of_a_continuous_model_is_held() -> None:
+    model = parse_model(Table(changed(MODEL, "plant.continuous", True), "f.toml"))
+    assert model.A[0, 0] == pytest.approx(np.exp(0.9 * 0.025))
+    assert model.E.shape == (2, 1)
+    assert model.E[0, 0] == pytest.approx(np.expm1(0.9 * 0.025) / 0.9)
+    assert model.C.tolist() == MODEL["plant"]["C"]
+    assert model.reference is not None
+    assert model.uncertainty is not None
+    assert model.reference.Ar.tolist() == [[0.5]]
+    assert model.uncertainty.F.tolist() == [[1.0], [0.0]]
+
+
+MODEL_COMPLAINTS = [
+    ("name", GONE, "name: expected a string, found nothing"),
+    ("name", 3, "name: expected a string, found 3"),
+    ("Ts", 0, "Ts: expected a number from 1e-06 to 3600, found 0"),
+    ("Ts", -0.1, "Ts: expected a number from 1e-06 to 3600, found -0.1"),
+    ("Ts", float("nan"), "Ts: expected a finite number from 1e-06 to 3600, found nan"),
+    ("Ts", True, "Ts: expected a number from 1e-06 to 3600, found the boolean true"),
+    ("plant", GONE, "plant: expected a table, found nothing"),
+    ("plant", 1, "plant: expected a table, found 1"),
+    ("plant.continuous", GONE, "plant.continuous: expected true or false, found nothing"),
+    ("plant.A", [[1.0, 2.0]], "plant.A: expected a square matrix, found 1 by 2"),
+    ("plant.A", [[1.0, 2.0], [1.0]], "plant.A[1]: expected 2 columns, found 1"),
+    ("plant.A", [[1.0, 0.0], [0.0, float("inf")]], "plant.A[1][1]: expected a finite number, found inf"),
+    ("plant.B", [[1.0], [1.0], [1.0]], "plant.B: expected 2 rows, found 3"),
+    ("plant.B", [0.0, 1.0], "plant.B[0]: expected a row of numbers, found 0.0"),
+    ("plant.E", [[1.0]], "plant.E: expected 2 rows, found 1"),
+    ("plant.C", [[1.0]], "plant.C: expected 2 columns, found 1"),
+    ("plant.D", [[0.0, 0.0]], "plant.D: expected 1 column, found 2"),
+    ("plant.D", [[0.0], [0.0]], "plant.D: expected 1 row, found 2"),
+    ("plant.states", ["a_rad"], "plant.states: expected 2 strings, found 1"),
+    ("plant.states", ["a_rad", "a_rad"], "plant.states: expected distinct names, found a_rad twice"),
+    ("plant.state", [], "plant.state: expected one of continuous, A, B, E, C, D, states, "
+                        "found an unknown key; did you mean states?"),
+    ("trim.x", [0.0], "trim.x: expected 2 numbers, found 1"),
+    ("trim.u", [2.0], "trim.u[0]: expected a number in the travel of [actuator], -1 to 1, found 2"),
+    ("actuator.low", [1.0], "actuator.high[0]: expected a number above low (1), found 1"),
+    ("actuator.low", [2.0], "actuator.high[0]: expected a number above low (2), found 1"),
+    ("actuator.high", GONE, "actuator.high: expected an array of 1 number, found nothing"),
+    ("actuator.high", [1.0, 1.0], "actuator.high: expected 1 number, found 2"),
+    ("actuator.rate", [0.0], "actuator.rate[0]: expected a number above 0, found 0.0"),
+    ("actuator.tau", [-0.1], "actuator.tau[0]: expected a number of at least 0, found -0.1"),
+    ("sensors.a_rad", GONE, "sensors.a_rad: expected MESSAGE.field, such as ATTITUDE.pitch, found nothing"),
+    ("sensors.a_rad", "pitch", 'sensors.a_rad: expected MESSAGE.field, such as ATTITUDE.pitch, '
+                               'found the string "pitch"'),
+    ("sensors.a_ra", "ATTITUDE.pitch", "sensors.a_ra: expected a state (a_rad, b_rad_s), "
+                                       "found an unknown name; did you mean a_rad?"),
+    ("reference.Ar", [[1.0, 0.0]], "reference.Ar: expected a square matrix, found 1 by 2"),
+    ("reference.Ar", [[1.0]], "reference.Ar: expected a Schur matrix (spectral radius below 1), "
+                              "found spectral radius 1"),
+    ("reference.Br", [[1.0], [1.0]], "reference.Br: expected 1 row, found 2"),
+    ("reference.Cr", [[1.0], [1.0]], "reference.Cr: expected 1 row, found 2"),
+    ("reference.Cr", [[1.0, 1.0]], "reference.Cr: expected 1 column, found 2"),
+    ("uncertainty.F", [[1.0]], "uncertainty.F: expected 2 rows, found 1"),
+    ("uncertainty.J1", [[1.0]], "uncertainty.J1: expected 2 columns, found 1"),
+    ("uncertainty.J2", [[1.0], [1.0]], "uncertainty.J2: expected 1 row, found 2"),
+    ("uncertainty.delta_max", -0.1, "uncertainty.delta_max: expected a number of at least 0, found -0.1"),
+    ("uncertainty.delta_max", GONE, "uncertainty.delta_max: expected a number of at least 0, found nothing"),
+    ("condition.airspeed_m_s", 0, "condition.airspeed_m_s: expected a number above 0, found 0"),
+    ("refrence", {}, "refrence: expected one of name, Ts, plant, actuator, trim, sensors, reference, "
+                     "uncertainty, condition, found an unknown key; did you mean reference?"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("field", "value", "complaint"), MODEL_COMPLAINTS)
+def test_a_wrong_model_is_refused_in_one_exact_line(field: str, value: object, complaint: str) -> None:
+    assert complaint_of(parse_model, changed(MODEL, field, value)) == f"f.toml: {complaint}"
+
+
+def test_neutral_outside_the_travel_is_refused_without_a_trim_too() -> None:
+    data = changed(changed(MODEL, "trim", GONE), "actuator.low", [0.5])
+    complaint = "trim.u[0]: expected a number in the travel of [actuator], 0.5 to 1, found 0"
+    assert complaint_of(parse_model, data) == f"f.toml: {complaint}"
+
+
+def test_a_plant_that_overflows_within_a_sample_is_refused() -> None:
+    data = changed(changed(MODEL, "plant.continuous", True), "plant.A", [[1e6, 0.0], [0.0, 1.0]])
+    complaint = "plant.A: expected a finite zero-order hold at Ts = 0.025 s, found an overflow"
+    assert complaint_of(parse_model, data) == f"f.toml: {complaint}"
+
+
+GAINS_COMPLAINTS = [
+    ("name", GONE, "name: expected a string, found nothing"),
+    ("model", 1, "model: expected a string, found 1"),
+    ("model", "hirn", "model: hirn: expected a stored name or a file, found neither; did you mean hirm?"),
+    ("d_min", -1, "d_min: expected an integer from 0 to 1000, found -1"),
+    ("d_min", GONE, "d_min: expected an integer from 0 to 1000, found nothing"),
+    ("d_min", 1.0, "d_min: expected an integer from 0 to 1000, found 1.0"),
+    ("d_min", 5, "d_max: expected an integer from 5 to 1000, found 4"),
+    ("d_max", True, "d_max: expected an integer from 1 to 1000, found the boolean true"),
+    ("d_max", DELAY_LIMIT + 1, "d_max: expected an integer from 1 to 1000, found 1001"),
+    ("K1", [[1.0, 2.0]], "K1: expected 3 columns, found 2"),
+    ("K1", [[1.0, 2.0, 3.0]] * 2, "K1: expected 1 row, found 2"),
+    ("K1", GONE, "K1: expected a matrix (an array of rows), found nothing"),
+    ("K2", [[1.0]], "K2: expected 3 columns, found 1"),
+    ("K2", GONE, "K2: expected a matrix (an array of rows), found nothing"),
+    ("certificate", 1, "certificate: expected a table, found 1"),
+    ("certficate", {}, "certficate: expected one of name, model, d_min, d_max, K1, K2, certificate, "
+                       "found an unknown key; did you mean certificate?"),
+    ("window", [{}], "window: expected K1 and K2, found a schedule; "
+                     "schedules are not supported by this version"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("field", "value", "complaint"), GAINS_COMPLAINTS)
+def test_wrong_gains_are_refused_in_one_exact_line(field: str, value: object, complaint: str) -> None:
+    assert complaint_of(parse_gains, changed(GAINS, field, value)) == f"f.toml: {complaint}"
+
+
+def test_reference_gains_without_a_reference_are_refused() -> None:
+    data = GAINS | {"model": "pendulum", "K1": [[1.0, 2.0]]}
+    complaint = "K2: expected none, as model pendulum has no [reference], found one"
+    assert complaint_of(parse_gains, data) == f"f.toml: {complaint}"
+
+
+def test_a_certificate_is_kept_as_it_is() -> None:
+    certificate = {"method": "exact", "anything": [1, {"deep": True}]}
+    gains = parse_gains(Table(GAINS | {"certificate": certificate}, "f.toml"))
+    assert gains.certificate == certificate
+    assert parse_gains(Table(GAINS, "f.toml")).certificate is None
+
+
+def test_a_schedule_is_refused_before_its_missing_gains() -> None:
+    data = {"name": "s", "model": "hirm", "window": [{"d_min": 1, "d_max": 2, "K1": [[1.0]]}]}
+    assert "schedules are not supported by this version" in complaint_of(parse_gains, data)
+
+
+def test_one_kind_of_file_is_not_the_other() -> None:
+    with pytest.raises(InputError, match=r"hirm-paper\.toml: expected a model file .*, found a gain file$"):
+        load_model("hirm-paper")
+    with pytest.raises(InputError, match=r"hirm\.toml: expected a gain file .*, found a model file$"):
+        load_gains("hirm")
+    assert isinstance(load("hirm"), Model)
+    assert isinstance(load("hirm-paper"), Gains)
+
+
+def test_stored_files_load_under_their_own_names() -> None:
+    entries = stored()
+    assert [(e.name, e.kind) for e in entries] == [
+        ("hirm", "model"), ("hirm-printed", "model"), ("pendulum", "model"), ("pendulum-exact", "model"),
+        ("hirm-paper", "gains"), ("pendulum-paper", "gains"),
+    ]  # fmt: skip
+    for entry in entries:
+        item = load(entry.name)
+        assert item.name == entry.name
+        model = item if isinstance(item, Model) else item.model
+        assert set(model.sensors) == set(model.states)
+        assert model.actuator is not None
+
+
+def test_stored_gains_carry_the_printed_windows_and_no_certificate() -> None:
+    windows = {name: load_gains(name) for name in ("hirm-paper", "pendulum-paper")}
+    assert {name: (g.d_min, g.d_max) for name, g in windows.items()} == {
+        "hirm-paper": (1, 4),
+        "pendulum-paper": (1, 6),
+    }
+    assert all(g.certificate is None for g in windows.values())
+    assert windows["pendulum-paper"].K2 is None
+
+
+def test_both_hirm_models_differ_in_the_plant_only() -> None:
+    folder = resolve("hirm").parent
+    exact, printed = (tomllib.loads((folder / f"{n}.toml").read_text()) for n in ("hirm", "hirm-printed"))
+    for data in (exact, printed):
+        del data["name"]
+        for key in ("continuous", "A", "B", "E"):
+            del data["plant"][key]
+    assert exact == printed
+
+
+def test_flight_condition_of_hirm_is_mach_0_3_in_the_standard_atmosphere() -> None:
+    condition = load_model("hirm").condition
+    assert condition is not None
+    temperature_k = 288.15 - 0.0065 * condition.altitude_m
+    assert condition.airspeed_m_s == pytest.approx(0.3 * np.sqrt(1.4 * 287.05287 * temperature_k), abs=0.01)
+
+
+def test_exact_pendulum_is_the_one_of_the_physical_constants() -> None:
+    data = tomllib.loads(resolve("pendulum-exact").read_text())
+    M, m, length, g = 8.0, 2.0, 0.5, 9.8
+    a = 3 * (M + m) * g / (length * (4 * M + m))
+    b = -3 / (length * (4 * M + m))
+    assert data["plant"]["A"] == [[0.0, 1.0], [a, 0.0]]
+    assert data["plant"]["B"] == [[0.0], [b]]
+
+
+def test_a_stored_name_wins_over_a_file_of_that_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "hirm").write_text("not toml")
+    assert load_model("hirm").nx == 3
+    with pytest.raises(InputError, match=r"^\./hirm|^hirm: expected TOML"):
+        load_model("./hirm")
+
+
+def test_the_model_of_gains_is_found_relative_to_their_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "a" / "b").mkdir(parents=True)
+    (tmp_path / "a" / "plant.toml").write_text(resolve("pendulum").read_text())
+    text = 'name = "g"\nmodel = "../plant.toml"\nd_min = 1\nd_max = 2\nK1 = [[1, 2]]\n'
+    (tmp_path / "a" / "b" / "g.toml").write_text(text)
+    monkeypatch.chdir("/")
+    assert load_gains(tmp_path / "a" / "b" / "g.toml").model.name == "pendulum"
+
+
+def test_a_fault_in_the_model_of_gains_names_the_model_file(tmp_path: Path) -> None:
+    (tmp_path / "plant.toml").write_text('name = "p"\nTs = 0\n')
+    (tmp_path / "g.toml").write_text('name = "g"\nmodel = "plant.toml"\nd_min = 1\nd_max = 2\nK1 = [[1]]\n')
+    with pytest.raises(InputError, match=r"plant\.toml: Ts: expected a number from 1e-06 to 3600, found 0$"):
+        load_gains(tmp_path / "g.toml")
+
+
+@pytest.mark.parametrize(
+    ("name", "complaint"),
+    [
+        ("hirmm", "hirmm: expected a stored name or a file, found neither; did you mean hirm?"),
+        ("./nowhere/x.toml", "./nowhere/x.toml: expected a stored name or a file, found neither"),
+        ("a\0b", r"a\x00b: expected a "),
+    ],
+)
+def test_a_name_that_is_nothing_is_refused(name: str, complaint: str) -> None:
+    with pytest.raises(InputError) as caught:
+        load(name)
+    assert str(caught.value).startswith(complaint)
+
+
+FIELDS = [f"{key}" for key in MODEL] + [
+    f"{key}.{inner}" for key, value in MODEL.items() if isinstance(value, dict) for inner in value
+]
+NUMBERS = st.floats() | st.integers() | st.booleans()
+VALUES = st.recursive(NUMBERS | st.text(max_size=3), lambda v: st.lists(v, max_size=3), max_leaves=9)
+MATRICES = st.integers(1, 3).flatmap(
+    lambda n: st.lists(st.lists(st.floats(), min_size=n, max_size=n), min_size=1, max_size=3)
+)
+
+
+@given(st.sampled_from(FIELDS), VALUES | MATRICES, st.booleans())
+def test_any_value_in_any_field_of_a_model_is_taken_or_refused(field: str, value: object, continuous: bool) -> None:
+    data = changed(changed(MODEL, "plant.continuous", continuous), field, value)
+    with contextlib.suppress(InputError):
+        assert np.isfinite(parse_model(Table(data, "f.toml")).A).all()
+
+
+@given(st.sampled_from([*GAINS, "certificate", "window"]), VALUES | MATRICES)
+def test_any_value_in_any_field_of_gains_is_taken_or_refused(field: str, value: object) -> None:
+    with contextlib.suppress(InputError):
+        assert parse_gains(Table(GAINS | {field: value}, "f.toml")).K1.shape == (1, 3)

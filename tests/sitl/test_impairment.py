@@ -1,0 +1,427 @@
+"""Impairment against scipy's distributions, exact schedules, and the grammar against itself."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy import stats
+
+from gains.table import InputError
+from sitl.impairment import (
+    JITTERS,
+    MAX_RATE_BPS,
+    MAX_TIME_NS,
+    PRESETS,
+    Copy,
+    Fate,
+    GammaJitter,
+    Impairment,
+    LinkSpec,
+    NormalJitter,
+    UniformJitter,
+    format_spec,
+    parse_link,
+    parse_spec,
+)
+
+MS = 1_000_000
+S = 1_000_000_000
+SAMPLES = 20_000
+
+
+def impairment(text: str, seed: int = 1) -> Impairment:
+    return Impairment(parse_spec(text), np.random.default_rng(seed))
+
+
+def flights_ns(text: str, seed: int = 1, samples: int = SAMPLES) -> np.ndarray:
+    """Time in the link of each packet, one a second."""
+    link = impairment(text, seed)
+    return np.array([link.schedule(100, n * S)[0] - n * S for n in range(samples)], dtype=float)
+
+
+def accepts(successes: int, trials: int, probability: float) -> bool:
+    return stats.binomtest(successes, trials, probability).pvalue > 1e-3
+
+
+def is_sorted(instants: list[int]) -> bool:
+    return all(a <= b for a, b in itertools.pairwise(instants))
+
+
+# ---------------------------------------------------------------------------------------- distributions
+
+
+@pytest.mark.parametrize(
+    ("spec", "distribution"),
+    [
+        ("delay=5ms,jitter=uniform:28ms", stats.uniform(loc=5 * MS, scale=28 * MS)),
+        ("delay=50ms,jitter=normal:4ms", stats.norm(loc=50 * MS, scale=4 * MS)),
+        ("delay=5ms,jitter=gamma:20ms", stats.gamma(a=2, loc=5 * MS, scale=10 * MS)),
+    ],
+)
+def test_jitter_follows_its_distribution(spec, distribution):
+    assert stats.kstest(flights_ns(spec), distribution.cdf).pvalue > 1e-3
+
+
+def test_every_jitter_model_has_a_distribution_test():
+    assert set(JITTERS) == {"uniform", "normal", "gamma"}
+
+
+def test_gamma_jitter_has_shape_2_and_the_mean_given():
+    samples = flights_ns("jitter=gamma:20ms")
+    shape, _, scale = stats.gamma.fit(samples, floc=0)
+    assert shape == pytest.approx(2.0, rel=0.03)
+    assert shape * scale == pytest.approx(20 * MS, rel=0.02)
+    assert samples.mean() == pytest.approx(20 * MS, rel=0.02)
+
+
+def test_uniform_jitter_stays_within_its_width():
+    samples = flights_ns("delay=5ms,jitter=uniform:28ms")
+    assert samples.min() >= 5 * MS
+    assert samples.max() <= 33 * MS
+
+
+def test_normal_jitter_never_makes_the_total_negative():
+    samples = flights_ns("delay=1ms,jitter=normal:2ms")
+    assert samples.min() == 0
+    clamped = int((samples == 0).sum())
+    assert accepts(clamped, SAMPLES, float(stats.norm.cdf(-0.5)))
+    truth = stats.norm(loc=1 * MS, scale=2 * MS)
+    flown = samples[samples > 0]
+    assert stats.kstest(flown, lambda t: (truth.cdf(t) - truth.cdf(0)) / truth.sf(0)).pvalue > 1e-3
+
+
+@pytest.mark.parametrize("probability", [0.01, 0.1, 0.5])
+def test_loss_rate_is_the_probability_given(probability):
+    links = [impairment(f"loss={probability}", seed) for seed in range(20)]
+    lost = sum(not link.schedule(100, n) for link in links for n in range(SAMPLES // 20))
+    assert accepts(lost, SAMPLES, probability)
+
+
+def test_losses_come_without_memory():
+    link = impairment("loss=0.3")
+    lost = np.array([not link.schedule(100, n) for n in range(SAMPLES)], dtype=float)
+    assert abs(np.corrcoef(lost[:-1], lost[1:])[0, 1]) < 4 / math.sqrt(SAMPLES)
+
+
+def test_certain_loss_loses_all_and_no_loss_loses_none():
+    certain, none = impairment("loss=1"), impairment("loss=0")
+    assert all(certain.step(100, n) == (Copy(Fate.LOST, n),) for n in range(100))
+    assert all(none.schedule(100, n) == (n,) for n in range(100))
+
+
+def test_duplicate_rate_is_the_probability_given_and_copies_draw_their_own_delay():
+    links = [impairment("jitter=uniform:28ms,dup=0.5", seed) for seed in range(20)]
+    schedules = [link.schedule(100, n * S) for link in links for n in range(SAMPLES // 20)]
+    pairs = np.array([s for s in schedules if len(s) == 2], dtype=float) % S
+    assert {len(s) for s in schedules} == {1, 2}
+    assert accepts(len(pairs), SAMPLES, 0.5)
+    assert abs(np.corrcoef(pairs.T)[0, 1]) < 4 / math.sqrt(len(pairs))
+    assert stats.kstest(pairs[:, 1], stats.uniform(scale=28 * MS).cdf).pvalue > 1e-3
+
+
+def test_reordered_packets_skip_the_delay_and_the_rest_keep_it():
+    link = impairment("delay=50ms,reorder=0.05")
+    flights = [link.schedule(100, n * MS)[0] - n * MS for n in range(SAMPLES)]
+    assert set(flights) == {0, 50 * MS}
+    assert accepts(flights.count(0), SAMPLES, 0.05)
+
+
+# ------------------------------------------------------------------------------------------------- rate
+
+
+@given(
+    sizes=st.lists(st.integers(0, 1500), min_size=1, max_size=50),
+    rate_bps=st.integers(1, 10**9),
+    delay_ns=st.integers(0, S),
+)
+def test_back_to_back_packets_are_spaced_by_their_serialisation(sizes, rate_bps, delay_ns):
+    link = Impairment(LinkSpec(delay_ns=delay_ns, rate_bps=rate_bps), np.random.default_rng(0))
+    exits = [link.schedule(size, 0)[0] - delay_ns for size in sizes]
+    # exact: the n-th packet is through when all bits up to its last are, rounded up to a whole ns
+    assert exits == [-(-8 * S * int(total) // rate_bps) for total in np.cumsum(sizes)]
+
+
+def test_spacing_at_a_rate_that_divides_is_size_times_8_over_rate():
+    link = impairment("rate=80kbps")
+    exits = [link.schedule(50, 0)[0] for _ in range(5)]
+    assert np.diff(exits).tolist() == [5 * MS] * 4
+
+
+def test_an_idle_serialiser_does_not_delay_the_next_packet():
+    link = impairment("rate=80kbps")
+    assert link.schedule(50, 0) == (5 * MS,)
+    assert link.schedule(50, 5 * MS) == (10 * MS,)
+    assert link.schedule(50, S) == (S + 5 * MS,)
+
+
+def test_a_reordered_packet_does_not_wait_for_the_serialiser():
+    link = impairment("rate=80kbps,reorder=0.5")
+    exits = {link.schedule(50, 0)[0] for _ in range(50)}
+    assert exits == {0} | {n * 5 * MS for n in range(1, len(exits))}
+
+
+@pytest.mark.parametrize("room", [0, 1])
+def test_refused_copies_take_no_airtime(room):
+    link = impairment("rate=80kbps,dup=1")
+    copies = [link.step(50, 0, room) for _ in range(100)]
+    assert all([copy.fate for copy in pair].count(Fate.REFUSED) == 2 - room for pair in copies)
+    assert link.schedule(50, 0)[0] == (room * 100 + 1) * 5 * MS
+
+
+# ------------------------------------------------------------------------------------------------ order
+
+
+@given(
+    seed=st.integers(0, 2**32),
+    gaps=st.lists(st.integers(0, 20 * MS), min_size=1, max_size=100),
+    rest=st.sampled_from(["", ",reorder=0.3", ",dup=0.3,loss=0.2", ",rate=57600bps,reorder=0.1"]),
+)
+def test_order_keep_never_reorders(seed, gaps, rest):
+    link = impairment("delay=5ms,jitter=uniform:28ms,order=keep" + rest, seed)
+    entries = np.cumsum(gaps).tolist()
+    exits = [instant for entry in entries for instant in link.schedule(60, entry)]
+    assert is_sorted(exits)
+
+
+def test_without_order_keep_jitter_reorders():
+    link = impairment("delay=5ms,jitter=uniform:28ms")
+    assert not is_sorted([link.schedule(60, n * MS)[0] for n in range(100)])
+
+
+@given(
+    seed=st.integers(0, 2**32),
+    text=st.sampled_from(["delay=5ms,jitter=gamma:20ms", "jitter=normal:9ms,rate=57600bps,dup=0.5,reorder=0.2"]),
+    entries=st.lists(st.integers(0, 100 * MS), max_size=60).map(sorted),
+)
+def test_no_packet_leaves_before_it_enters(seed, text, entries):
+    link = impairment(text, seed)
+    assert all(instant >= entry for entry in entries for instant in link.schedule(60, entry))
+
+
+# ---------------------------------------------------------------------------------------------- streams
+
+
+def test_same_seed_gives_the_same_schedule_and_another_seed_another():
+    text = "delay=5ms,jitter=gamma:28ms,loss=0.1,dup=0.1,reorder=0.1"
+    one, same, other = (
+        [link.schedule(60, n * MS) for n in range(500)]
+        for link in (impairment(text, 7), impairment(text, 7), impairment(text, 8))
+    )
+    assert one == same
+    assert one != other
+
+
+@pytest.mark.parametrize("jitter", ["uniform:28ms", "normal:4ms", "gamma:20ms"])
+@pytest.mark.parametrize("added", ["loss=0.2", "dup=0.5", "reorder=0.1", "blackout=2s:3s"])
+def test_adding_a_feature_leaves_the_jitter_of_each_packet_as_it_was(jitter, added):
+    base = f"delay=40ms,jitter={jitter}"
+    plain, impaired = impairment(base), impairment(f"{base},{added}")
+    kept = 0
+    for entry in range(0, 10 * S, 10 * MS):
+        (expected,), found = plain.schedule(60, entry), impaired.schedule(60, entry)
+        kept += bool(found) and found[0] == expected
+        assert not found or found[0] in (expected, entry)  # entry: it overtook
+    assert 500 < kept < 1000 or (added.startswith("dup") and kept == 1000)
+
+
+def test_packets_lost_at_a_low_rate_are_lost_at_a_high_rate():
+    low, high = impairment("loss=0.1"), impairment("loss=0.3")
+    lost = [(not low.schedule(60, n), not high.schedule(60, n)) for n in range(2000)]
+    assert all(at_high for at_low, at_high in lost if at_low)
+
+
+def test_entry_times_and_sizes_do_not_change_the_draws():
+    text = "delay=5ms,jitter=uniform:28ms,loss=0.2,dup=0.2"
+    dense, sparse = impairment(text), impairment(text)
+    for n in range(500):
+        at_ns = n * S
+        assert [t - n for t in dense.schedule(10, n)] == [t - at_ns for t in sparse.schedule(900, at_ns)]
+
+
+# -------------------------------------------------------------------------------------------- blackouts
+
+
+def test_a_blackout_takes_no_packet_from_its_start_to_just_before_its_end():
+    link = impairment("blackout=3s:2s,blackout=8s:1s")
+    fates = {t: link.step(60, t)[0].fate for t in (0, 3 * S - 1, 3 * S, 5 * S - 1, 5 * S, 8 * S, 9 * S)}
+    out = {t for t, fate in fates.items() if fate is Fate.BLACKOUT}
+    assert out == {3 * S, 5 * S - 1, 8 * S}
+
+
+def test_a_blackout_drops_what_would_leave_during_it():
+    link = impairment("delay=100ms,blackout=1s:1s")
+    instants = [9 * S // 10 - 1, 9 * S // 10, 2 * S - 1, 2 * S]
+    copies = [link.step(60, t)[0] for t in instants]
+    assert [copy.fate for copy in copies] == ["delivered", "blackout", "blackout", "delivered"]
+    assert copies[1].exit_ns == S  # in flight until it would have left
+    assert copies[2].exit_ns == 2 * S - 1  # never taken
+    assert link.schedule(60, 2 * S) == (2 * S + 100 * MS,)
+
+
+# ---------------------------------------------------------------------------------------------- grammar
+
+
+def test_the_spec_of_the_handbook_parses():
+    text = "delay=25ms,jitter=uniform:28ms,loss=0.1,dup=0.01,reorder=0.05,order=keep,rate=57600bps,blackout=3s:2s"
+    spec = LinkSpec(
+        delay_ns=25 * MS,
+        jitter=UniformJitter(28 * MS),
+        loss=0.1,
+        dup=0.01,
+        reorder=0.05,
+        keep_order=True,
+        rate_bps=57_600,
+        blackouts=((3 * S, 2 * S),),
+    )
+    assert parse_spec(text) == spec
+    assert format_spec(spec) == text
+
+
+@pytest.mark.parametrize(
+    ("text", "delay_ns"),
+    [
+        ("0.2ms", 200_000),
+        ("7ns", 7),
+        ("1.5us", 1500),
+        ("0.1s", 100 * MS),
+        ("0s", 0),
+        ("1000000s", MAX_TIME_NS),
+    ],
+)
+def test_times_are_read_exactly_in_every_unit(text, delay_ns):
+    assert parse_spec(f"delay={text}").delay_ns == delay_ns
+
+
+@pytest.mark.parametrize(("text", "bps"), [("57600bps", 57_600), ("57.6kbps", 57_600), ("1.5Mbps", 1_500_000)])
+def test_rates_are_read_exactly_in_every_unit(text, bps):
+    assert parse_spec(f"rate={text}").rate_bps == bps
+
+
+def test_spaces_around_items_are_ignored_and_blackouts_repeat():
+    spec = parse_spec(" delay = 1ms , blackout=1s:1s, blackout=4s:500ms ")
+    assert spec == LinkSpec(delay_ns=MS, blackouts=((S, S), (4 * S, S // 2)))
+
+
+TIME = "expected a time with its unit (s, ms, us, ns) up to 1000000s, found"
+PROBABILITY = "expected a probability from 0 to 1, found"
+RATE = f"expected a rate above 0 with its unit (Mbps, kbps, bps) up to {MAX_RATE_BPS}bps, found"
+JITTER = "expected one of uniform:…, normal:…, gamma:…, as in uniform:28ms, found"
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("loss=2", f"loss: {PROBABILITY} 2"),
+        ("loss=-0.1", f"loss: {PROBABILITY} -0.1"),
+        ("loss=nan", f"loss: {PROBABILITY} nan"),
+        ("loss=0_1", f"loss: {PROBABILITY} 0_1"),
+        ("loss=٠.٥", f"loss: {PROBABILITY} ٠.٥"),
+        ("dup=many", f"dup: {PROBABILITY} many"),
+        ("reorder=", f"reorder: {PROBABILITY} nothing"),
+        ("delay=25", f"delay: {TIME} 25"),
+        ("delay=-1ms", f"delay: {TIME} -1ms"),
+        ("delay=25min", f"delay: {TIME} 25min"),
+        ("delay=0.5ns", f"delay: {TIME} 0.5ns"),
+        ("delay=1000001s", f"delay: {TIME} 1000001s"),
+        ("delay=٣ms", f"delay: {TIME} ٣ms"),
+        ("jitter=28ms", f"jitter: {JITTER} 28ms"),
+        ("jitter=cauchy:3ms", f"jitter: {JITTER} cauchy:3ms"),
+        ("jitter=normal:3", f"jitter: {TIME} normal:3"),
+        ("order=lose", "order: expected keep, found lose"),
+        ("rate=57600", f"rate: {RATE} 57600"),
+        ("rate=0bps", f"rate: {RATE} 0bps"),
+        ("rate=0.5bps", f"rate: {RATE} 0.5bps"),
+        ("blackout=3s", "blackout: expected start:duration, as in 3s:2s, found 3s"),
+        ("blackout=3s:2", f"blackout: {TIME} 3s:2"),
+        ("delay=1ms,delay=2ms", "delay: expected once, found again with 2ms"),
+        ("loss", "expected keyword=value, found loss"),
+        ("", "expected keyword=value, found nothing"),
+        ("loss=0.1,", "expected keyword=value, found nothing"),
+        (
+            "lag=3ms",
+            "expected a keyword of delay, jitter, loss, dup, reorder, order, rate, blackout, found lag",
+        ),
+    ],
+)
+def test_a_bad_spec_is_refused_in_one_clear_line(text, message):
+    with pytest.raises(InputError) as refusal:
+        parse_spec(text)
+    assert str(refusal.value) == f'link spec "{text}": {message}'
+
+
+@given(st.text() | st.from_regex(r"(delay|jitter|loss|rate|blackout)=.*", fullmatch=True))
+def test_any_text_is_a_spec_or_one_line_of_refusal(text):
+    refusal = ""
+    try:
+        spec = parse_spec(text)
+    except InputError as error:
+        refusal = str(error)
+    else:
+        assert parse_spec(format_spec(spec)) == spec
+    assert len(refusal.splitlines()) <= 1
+
+
+times = st.integers(0, MAX_TIME_NS) | st.integers(0, 1000).map(lambda ms: ms * MS)
+probabilities = st.floats(0, 1)
+specs = st.builds(
+    LinkSpec,
+    delay_ns=times,
+    jitter=st.none() | st.builds(lambda model, scale: model(scale), st.sampled_from(list(JITTERS.values())), times),
+    loss=probabilities,
+    dup=probabilities,
+    reorder=probabilities,
+    keep_order=st.booleans(),
+    rate_bps=st.none() | st.integers(1, MAX_RATE_BPS),
+    blackouts=st.lists(st.tuples(times, times), max_size=3).map(tuple),
+)
+
+
+@given(specs)
+def test_parse_is_the_inverse_of_format(spec):
+    assert parse_spec(format_spec(spec)) == spec
+
+
+def test_the_format_is_the_shortest_in_whole_units():
+    assert format_spec(LinkSpec()) == "delay=0ns"
+    assert format_spec(LinkSpec(delay_ns=200_000)) == "delay=200us"
+    assert format_spec(LinkSpec(jitter=NormalJitter(4 * MS), rate_bps=10**6)) == "jitter=normal:4ms,rate=1Mbps"
+    assert format_spec(LinkSpec(jitter=GammaJitter(1))) == "jitter=gamma:1ns"
+
+
+# ---------------------------------------------------------------------------------------------- presets
+
+
+def test_presets_are_what_the_handbook_says():
+    assert set(PRESETS) == {"perfect", "lan", "jittery", "lossy"}
+    jittery = parse_spec("delay=5ms,jitter=uniform:28ms")
+    assert PRESETS["perfect"] == (LinkSpec(), LinkSpec())
+    assert PRESETS["lan"] == (parse_spec("delay=0.2ms"),) * 2
+    assert PRESETS["jittery"] == (jittery, jittery)
+    assert PRESETS["lossy"] == (replace(jittery, loss=0.1, dup=0.01),) * 2
+
+
+def test_a_loop_over_the_jittery_link_spans_1_to_3_samples_of_25_ms():
+    up, down = (flights_ns(format_spec(spec), seed) for seed, spec in enumerate(PRESETS["jittery"]))
+    samples = np.ceil((up + down) / (25 * MS))
+    assert set(samples.tolist()) == {1.0, 2.0, 3.0}
+
+
+def test_up_and_down_take_the_place_of_the_preset():
+    lan = PRESETS["lan"][0]
+    assert parse_link(None, None, None) == PRESETS["perfect"]
+    assert parse_link("lan", None, None) == PRESETS["lan"]
+    assert parse_link("lan", "loss=0.5", None) == (LinkSpec(loss=0.5), lan)
+    assert parse_link("lan", None, "loss=0.5") == (lan, LinkSpec(loss=0.5))
+    assert parse_link(None, "delay=1s", "loss=0.5") == (LinkSpec(delay_ns=S), LinkSpec(loss=0.5))
+
+
+def test_an_unknown_preset_is_refused_with_the_known_ones():
+    with pytest.raises(InputError) as refusal:
+        parse_link("moon", None, None)
+    assert str(refusal.value) == "link preset: expected one of perfect, lan, jittery, lossy, found moon"
