@@ -5,35 +5,32 @@ sending and our receiving, so with offset = peer - own
 
     tc1 - t_received  <=  offset  <=  tc1 - ts1.
 
-Each exchange is two inequalities that hold whatever the latency and however asymmetric the link. Over a
-sliding window, widened with age by the largest drift two clocks may have, their intersection is the
-estimate; an empty intersection means that a clock has stepped.
+Each exchange is two inequalities that hold whatever the latency and however asymmetric the link. The
+intersection of all of them, each widened with its age by the largest drift that two clocks may have, is
+the estimate. All widen at the same rate, so the intersection is kept by one recursion, and nothing is
+ever forgotten but by growing loose. An empty intersection means that a clock has stepped.
 """
 
 from __future__ import annotations
 
-from collections import deque
 from dataclasses import dataclass, field
 from enum import StrEnum
 
-from autopilot.link.clock import NS_PER_MS, NS_PER_S
+from autopilot.link.clock import NS_PER_S
 
 __all__ = ["ClockEstimate", "ClockStatus", "ClockSync"]
 
-WINDOW = 100
-"""Exchanges that bound the offset: 10 s at 10 Hz."""
-
-MAX_DRIFT_PPM = 400
-"""Largest relative drift between two clocks, two crystals at +-200 ppm."""
+MAX_DRIFT_PPB = 400_100
+"""Largest relative drift between two clocks, parts per billion: two crystals at +-200 ppm, one against the other."""
 
 MAX_OUTSTANDING = 64
 """Requests that may wait for an answer; the oldest is forgotten first."""
 
 MIN_EXCHANGES = 5
-"""Exchanges before the interval counts as an estimate."""
+"""Exchanges before the interval counts as locked."""
 
 STEP_CONFIRMATIONS = 3
-"""Consecutive exchanges that contradict the window before the clock counts as stepped."""
+"""Consecutive exchanges that contradict the interval before the clock counts as stepped."""
 
 STALE_NS = 5 * NS_PER_S
 """Without an exchange for so long the estimate is not trusted."""
@@ -66,18 +63,42 @@ class ClockEstimate:
     status: ClockStatus
 
 
+def _drift_ns(elapsed_ns: int) -> int:
+    """Return by how much two clocks may part in a time, rounded up."""
+    return -(-elapsed_ns * MAX_DRIFT_PPB // NS_PER_S)
+
+
 @dataclass(frozen=True, slots=True)
-class _Exchange:
-    """The interval of one exchange, at the own time of its answer."""
+class _Interval:
+    """low <= offset <= high at own time ``at_ns``, from ``exchanges`` exchanges."""
 
     at_ns: int
     low_ns: int
     high_ns: int
+    exchanges: int = 1
+
+    def at(self, now_ns: int) -> _Interval:
+        """Return the interval widened by the drift since."""
+        widening_ns = _drift_ns(now_ns - self.at_ns)
+        return _Interval(now_ns, self.low_ns - widening_ns, self.high_ns + widening_ns, self.exchanges)
+
+    def meet(self, other: _Interval) -> _Interval | None:
+        """Return the intersection with a later interval; None when there is none."""
+        mine = self.at(other.at_ns)
+        low_ns, high_ns = max(mine.low_ns, other.low_ns), min(mine.high_ns, other.high_ns)
+        if low_ns > high_ns:
+            return None
+        return _Interval(other.at_ns, low_ns, high_ns, self.exchanges + other.exchanges)
+
+    @property
+    def middle_ns(self) -> int:
+        """The middle of the interval."""
+        return (self.low_ns + self.high_ns) // 2
 
 
 @dataclass(slots=True)
 class ClockSync:
-    """Offset estimator: state of the window; ``step``-like methods, no I/O, own time passed in.
+    """Offset estimator: the interval and the requests under way; no I/O, own time passed in.
 
     Attributes
     ----------
@@ -93,8 +114,8 @@ class ClockSync:
     last_step_ns: int = 0
     unmatched: int = 0
     _outstanding: dict[int, None] = field(default_factory=dict)
-    _window: deque[_Exchange] = field(default_factory=lambda: deque(maxlen=WINDOW))
-    _contradicting: list[_Exchange] = field(default_factory=list)
+    _interval: _Interval | None = None
+    _contradicting: list[_Interval] = field(default_factory=list)
 
     def request(self, now_ns: int) -> int:
         """Return the ``ts1`` of a new request sent now, and remember it."""
@@ -109,39 +130,34 @@ class ClockSync:
             self.unmatched += 1
             return None
         del self._outstanding[ts1]
-        exchange = _Exchange(now_ns, tc1 - now_ns, tc1 - ts1)
-        low_ns, high_ns = self._interval(now_ns)
-        if self._window and (exchange.low_ns > high_ns or exchange.high_ns < low_ns):
+        # the upper bound is from the time of sending: the clocks have drifted since
+        exchange = _Interval(now_ns, tc1 - now_ns, tc1 - ts1 + _drift_ns(now_ns - ts1))
+        narrowed = exchange if self._interval is None else self._interval.meet(exchange)
+        if narrowed is not None:
+            self._interval = narrowed
+            self._contradicting.clear()
+        else:
             self._contradicting.append(exchange)
             if len(self._contradicting) >= STEP_CONFIRMATIONS:
-                self._restart_window((low_ns + high_ns) // 2)
-        else:
-            self._contradicting.clear()
-            self._window.append(exchange)
+                self._step()
         return now_ns - ts1
 
     def estimate(self, now_ns: int) -> ClockEstimate:
         """Return the offset at ``now_ns``."""
-        if not self._window or now_ns - self._window[-1].at_ns > STALE_NS:
+        if self._interval is None or now_ns - self._interval.at_ns > STALE_NS:
             return ClockEstimate(0, 0, ClockStatus.UNSYNCHRONISED)
-        low_ns, high_ns = self._interval(now_ns)
-        status = ClockStatus.LOCKED if len(self._window) >= MIN_EXCHANGES else ClockStatus.CONVERGING
-        return ClockEstimate((low_ns + high_ns) // 2, max(0, (high_ns - low_ns + 1) // 2), status)
+        interval = self._interval.at(now_ns)
+        status = ClockStatus.LOCKED if interval.exchanges >= MIN_EXCHANGES else ClockStatus.CONVERGING
+        return ClockEstimate(interval.middle_ns, (interval.high_ns - interval.low_ns + 1) // 2, status)
 
-    def _interval(self, now_ns: int) -> tuple[int, int]:
-        """Intersect the window's intervals, each widened by the drift since its exchange."""
-        low_ns, high_ns = -(1 << 63), 1 << 63
-        for e in self._window:
-            widening_ns = (now_ns - e.at_ns) * MAX_DRIFT_PPM // NS_PER_MS
-            low_ns = max(low_ns, e.low_ns - widening_ns)
-            high_ns = min(high_ns, e.high_ns + widening_ns)
-        return low_ns, high_ns
-
-    def _restart_window(self, old_offset_ns: int) -> None:
-        """Forget the window and go on from the exchanges that contradicted it."""
+    def _step(self) -> None:
+        """Go on from the exchanges that contradicted the interval."""
+        assert self._interval is not None
         newest = self._contradicting[-1]
         self.steps += 1
-        self.last_step_ns = (newest.low_ns + newest.high_ns) // 2 - old_offset_ns
-        self._window.clear()
-        self._window.extend(self._contradicting)
+        self.last_step_ns = newest.middle_ns - self._interval.at(newest.at_ns).middle_ns
+        joined: _Interval | None = newest
+        for exchange in self._contradicting[:-1]:
+            joined = joined and exchange.meet(joined)
+        self._interval = joined or newest  # they may contradict each other when the clock stepped among them
         self._contradicting.clear()

@@ -29,7 +29,7 @@ MIN_TRANSITS = 5
 """Transits before there is a forecast."""
 
 STALE_NS = 5 * NS_PER_S
-"""Transits older than this do not describe the link any more."""
+"""After so long without a transit there is no forecast, and the transits before describe the link no more."""
 
 
 class DelayStatus(StrEnum):
@@ -76,6 +76,8 @@ class DelayEstimator:
 
     def transit(self, tc1: int, ts1: int, now_ns: int) -> None:
         """Take one TIMESYNC exchange: its request left at ts1 (own time) and arrived at tc1 (plant's time)."""
+        if self._transits and now_ns - self._transits[-1][0] > STALE_NS:
+            self._transits.clear()
         self._transits.append((now_ns, tc1 - ts1))
         ordered = sorted(transit for _, transit in self._transits)
         self._quantiles = (ordered[0], ordered[len(ordered) // 2], ordered[-1])

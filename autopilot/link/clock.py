@@ -43,10 +43,10 @@ class Clock:
         """Return the earliest true time at which the clock shows at least ``node_ns``."""
         wanted_ns = node_ns - self.offset_ns
         guess_ns = self.boot_ns + wanted_ns * NS_PER_S // (NS_PER_S + self.drift_ppb)
-        while self.node_ns(guess_ns) >= node_ns:
-            guess_ns -= 1
         while self.node_ns(guess_ns) < node_ns:
             guess_ns += 1
+        while self.node_ns(guess_ns - 1) >= node_ns:
+            guess_ns -= 1
         return guess_ns
 
 

@@ -178,7 +178,7 @@ class McapRecorder:
     Attributes
     ----------
     lost : int
-        Messages that did not reach the file after it failed, those of the torn chunk included.
+        Messages that did not reach the file after it failed, all those of the torn chunk included.
     refused : int
         Messages of topics beyond ``MAX_TOPICS``.
     error : str

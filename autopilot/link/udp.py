@@ -110,10 +110,10 @@ class UdpPort:
         """Return the next datagram of the peer, b"" for one that was dropped, None when there is none."""
         try:
             datagram, sender = self.socket.recvfrom(MAX_DATAGRAM)
-        except (ConnectionRefusedError, ConnectionResetError):
-            return b""  # an earlier datagram of ours found nobody: the peer is not there
         except BlockingIOError:
             return None
+        except OSError:
+            return b""  # an earlier datagram of ours found nobody: no host, no network, or no program there
         if not self._connected and not self._is_peer((sender[0], sender[1]), datagram, now_ns):
             self.strangers += 1
             return b""

@@ -78,7 +78,7 @@ class VirtualNetwork:
         while not until():
             instant = self._earliest()
             if instant is None or instant > limit_ns:
-                self.now_ns = limit_ns
+                self.now_ns = max(self.now_ns, limit_ns)
                 return
             self.now_ns = instant
             if self._deliveries and self._deliveries[0][0] <= instant:
@@ -94,10 +94,11 @@ class VirtualNetwork:
             self._collect(i)
 
     def _earliest(self) -> int | None:
-        times = [due for due in self._due if due is not None]
-        if self._deliveries:
-            times.append(self._deliveries[0][0])
-        return max(self.now_ns, min(times)) if times else None
+        earliest = self._deliveries[0][0] if self._deliveries else None
+        for due in self._due:
+            if due is not None and (earliest is None or due < earliest):
+                earliest = due
+        return None if earliest is None else max(self.now_ns, earliest)
 
     def _next_due(self, i: int) -> int | None:
         p = self._participants[i]

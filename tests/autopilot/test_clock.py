@@ -82,6 +82,8 @@ def test_unwrap_restores_a_counter_from_any_reading_within_half_its_range(near, 
     assert unwrap((near + away) % modulus, near, modulus) == near + away
 
 
-@pytest.mark.parametrize(("value", "near", "expected"), [(5, (1 << 32) - 3, (1 << 32) + 5), ((1 << 32) - 3, (1 << 32) + 5, (1 << 32) - 3)])
+@pytest.mark.parametrize(
+    ("value", "near", "expected"), [(5, (1 << 32) - 3, (1 << 32) + 5), ((1 << 32) - 3, (1 << 32) + 5, (1 << 32) - 3)]
+)
 def test_unwrap_crosses_the_wrap_both_ways(value, near, expected):
     assert unwrap(value, near, 1 << 32) == expected

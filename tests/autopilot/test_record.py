@@ -295,7 +295,8 @@ def test_a_full_disk_ends_the_recording_and_is_counted(tmp_path: Path) -> None:
     assert str(path) in recorder.error
     kept = salvage(path)
     assert len(kept) > 0
-    assert len(kept) + recorder.lost == 200 * 16
+    # of the torn chunk, all counts as lost; a reader may still find its messages where only its index is torn
+    assert 200 * 16 <= len(kept) + recorder.lost <= 200 * 16 + 200
 
 
 @pytest.mark.parametrize("failing", range(1, 12))

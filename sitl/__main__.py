@@ -1,0 +1,252 @@
+"""The ``sitl`` program: the world around the autopilot, piece by piece or as one flight."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from datetime import datetime
+from pathlib import Path
+from typing import Any, Literal
+
+import click
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+
+from autopilot.link.process import ADDRESS, ProcessOptions, process_options, run_node
+from autopilot.link.udp import Address, dial, listen
+from autopilot.link.wire import AUTOPILOT, frames_of
+from gains.command import NEGATIVE, SUCCESS, print_json, run, version
+from gains.store import load_model
+from gains.table import InputError
+from sitl.aircraft.disturbance import HarmonicGust, SquareDelta
+from sitl.fly import DEFAULT_PORT_BASE, FlightOptions, fly
+from sitl.impairment import PRESETS, parse_link
+from sitl.plant import DEFAULT_SERVO_TIMEOUT, PlantConfig, PlantNode
+from sitl.processes import ChildDied
+from sitl.relay import RelayNode
+from sitl.scenario import Scenario, load_scenario, stored_scenarios
+from sitl.summary import summary_table
+
+__all__ = ["main"]
+
+INTERRUPTED = 130
+
+
+@click.group(context_settings={"help_option_names": ["-h", "--help"]})
+@click.version_option(version())
+def cli() -> None:
+    """Fly the autopilot in the loop: aircraft, link, scenarios, recordings."""
+
+
+def _vector(text: str) -> NDArray[np.float64]:
+    """Return comma-separated numbers as an array."""
+    try:
+        values = np.array([float(part) for part in text.split(",")])
+    except ValueError:
+        raise InputError(f'--x0 "{text}": expected numbers such as 0.1,0') from None
+    if not np.all(np.isfinite(values)):
+        raise InputError(f'--x0 "{text}": expected finite numbers')
+    return values
+
+
+def _square(text: str) -> SquareDelta:
+    """Return AMPLITUDE:HALF_PERIOD as the signal of Eq. (51)."""
+    amplitude, _, half_period = text.partition(":")
+    try:
+        delta = SquareDelta(float(amplitude), int(half_period or 20))
+    except ValueError:
+        raise InputError(f'--uncertainty "{text}": expected AMPLITUDE:SAMPLES such as 0.15:20') from None
+    if not np.isfinite(delta.amplitude) or delta.half_period < 1:
+        raise InputError(f'--uncertainty "{text}": expected a finite amplitude and at least one sample')
+    return delta
+
+
+@cli.command()
+@click.option("--plant", "plant_name", default="hirm", show_default=True, help="Stored model, or a model file.")
+@click.option("--listen", "address", type=ADDRESS, default="127.0.0.1:14600", show_default=True)
+@click.option("--peer", type=ADDRESS, help="The one address to hear; else the first that sends a valid frame.")
+@click.option(
+    "--latch",
+    type=click.Choice(["newest", "last"]),
+    default="newest",
+    show_default=True,
+    help="Of the commands that came in time: the newest sample's, or the last arrived.",
+)
+@click.option(
+    "--servo-timeout",
+    type=click.IntRange(0),
+    default=DEFAULT_SERVO_TIMEOUT,
+    show_default=True,
+    help="Samples without a new command after which the elevator goes to neutral; 0 for never.",
+)
+@click.option("--x0", help="State at k = 0, comma-separated; trim by default.")
+@click.option("--gust", "gust_s", type=click.FloatRange(0.0), help="The gust of Eq. (52), from this time in s on.")
+@click.option("--uncertainty", help="Delta(k) of Eq. (51) as AMPLITUDE:HALF_PERIOD, for example 0.15:20.")
+@process_options
+def plant(
+    plant_name: str,
+    address: Address,
+    peer: Address | None,
+    latch: Literal["newest", "last"],
+    servo_timeout: int,
+    x0: str | None,
+    gust_s: float | None,
+    uncertainty: str | None,
+    **process: Any,
+) -> None:
+    """Fly an aircraft: integrate, sense, take the elevator from the network. Runs until Ctrl-C."""
+    model = load_model(plant_name)
+    start = _vector(x0) if x0 is not None else None
+    if start is not None and start.shape != (model.nx,):
+        raise InputError(f"--x0: expected {model.nx} numbers, found {start.size}")
+    if gust_s is not None and model.nw == 0:
+        raise InputError(f"--gust: expected a plant with a disturbance input E, found {model.name} without")
+    if uncertainty is not None and model.uncertainty is None:
+        raise InputError(f"--uncertainty: expected a plant with [uncertainty], found {model.name} without")
+    config = PlantConfig(
+        model,
+        start,
+        None if gust_s is None else HarmonicGust(model.nw, round(gust_s / model.Ts)),
+        None if uncertainty is None else _square(uncertainty),
+        latch,
+        servo_timeout or None,
+    )
+    ports = [listen("autopilot", address, peer=peer, accept=frames_of(AUTOPILOT))]
+    metadata = {"program": "sitl plant", "plant": plant_name, "lagproof": version()}
+    run_node("plant", PlantNode(config), ports, ProcessOptions(**process), metadata, tap=False)
+
+
+LINK_OPTIONS = (
+    click.option("--link", "preset", type=click.Choice(sorted(PRESETS)), help="A link for both directions."),
+    click.option("--up", help="Plant to autopilot: delay=25ms,jitter=uniform:28ms,loss=0.1,... (README)."),
+    click.option("--down", help="Autopilot to plant, likewise."),
+)
+
+
+def _link_options(command: Any) -> Any:
+    for option in reversed(LINK_OPTIONS):
+        command = option(command)
+    return command
+
+
+@cli.command()
+@click.option("--listen", "address", type=ADDRESS, default="127.0.0.1:14601", show_default=True)
+@click.option("--to", type=ADDRESS, default="127.0.0.1:14600", show_default=True, help="The plant.")
+@click.option("--peer", type=ADDRESS, help="The one client to hear; else the first that sends a valid frame.")
+@click.option("--accept", type=click.Choice(["mavlink", "any"]), default="mavlink", show_default=True,
+              help="What a client must send to be heard: a frame of the autopilot, or anything.")  # fmt: skip
+@_link_options
+@click.option("--seed", type=click.IntRange(0), default=1, show_default=True)
+@process_options
+def relay(
+    address: Address,
+    to: Address,
+    peer: Address | None,
+    accept: str,
+    preset: str | None,
+    up: str | None,
+    down: str | None,
+    seed: int,
+    **process: Any,
+) -> None:
+    """Delay, lose and reorder what passes between a client and the plant. Runs until Ctrl-C."""
+    link = parse_link(preset, up, down)
+    heard = frames_of(AUTOPILOT) if accept == "mavlink" else lambda _datagram: True
+    ports = [listen("autopilot", address, peer=peer, accept=heard), dial("plant", to)]
+    metadata = {"program": "sitl relay", "seed": str(seed), "lagproof": version()}
+    run_node("relay", RelayNode(*link, seed), ports, ProcessOptions(**process), metadata, tap=False)
+
+
+@cli.command("fly")
+@click.argument("scenario_name", metavar="[SCENARIO]", default="nominal")
+@click.option("--plant", "plant_name", help="Another plant than the scenario's.")
+@click.option("--gains", "gains_name", help="Other gains than the scenario's.")
+@_link_options
+@click.option("--seed", type=click.IntRange(0), help="Of everything random.")
+@click.option("--duration", type=click.FloatRange(0.0, 86_400.0, min_open=True), help="Seconds.")
+@click.option("--virtual", is_flag=True, help="In virtual time: one process, no socket, much faster.")
+@click.option("--actuator", type=click.Choice(["pwm", "float"]), help="SERVO_OUTPUT_RAW or HIL_ACTUATOR_CONTROLS.")
+@click.option("--failsafe", type=click.Choice(["on", "monitor"]), help="monitor: report, but fly the law.")
+@click.option("--out", type=click.Path(file_okay=False, path_type=Path), help="Folder for the files.")
+@click.option("--gcs", multiple=True, default=("udpout:127.0.0.1:14550",), show_default=True,
+              help='Ground station; may be repeated; "none" for none.')  # fmt: skip
+@click.option("--port-base", type=click.IntRange(0, 65_000), default=DEFAULT_PORT_BASE, show_default=True,
+              help="The plant's port, the relay's is the next; 0 for any free ones.")  # fmt: skip
+@click.option("--json", "as_json", is_flag=True, help="Print the summary as one JSON object.")
+def fly_(
+    scenario_name: str,
+    plant_name: str | None,
+    gains_name: str | None,
+    preset: str | None,
+    up: str | None,
+    down: str | None,
+    virtual: bool,
+    out: Path | None,
+    gcs: tuple[str, ...],
+    port_base: int,
+    as_json: bool,
+    **changes: Any,
+) -> int:
+    """Fly a SCENARIO (nominal by default) and judge it: exit 0 when every check passes.
+
+    A scenario is a stored name (see "sitl scenarios") or a TOML file.
+    """
+    scenario = load_scenario(scenario_name, gains=gains_name, plant=plant_name)
+    scenario = _changed(scenario, preset, up, down, changes)
+    stations = tuple(address for address in gcs if address != "none")
+    for address in stations:
+        ADDRESS.convert(address, None, None)
+    folder = out or Path("flights") / f"{scenario.name}-{datetime.now():%Y%m%d-%H%M%S}"
+    console = Console(stderr=True)
+    try:
+        outcome = fly(scenario, FlightOptions(virtual, folder, stations, port_base), console)
+    except ChildDied as death:
+        click.echo(f"sitl: error: {death}", err=True)
+        return NEGATIVE
+    if as_json:
+        print_json(outcome.summary)
+    else:
+        Console().print(summary_table(outcome.summary, outcome.verdicts))
+    if outcome.interrupted:
+        return INTERRUPTED
+    return SUCCESS if outcome.passed else NEGATIVE
+
+
+def _changed(
+    scenario: Scenario, preset: str | None, up: str | None, down: str | None, changes: dict[str, Any]
+) -> Scenario:
+    """Return the scenario with what the command line changes; its variants change alike."""
+    given = {name: value for name, value in changes.items() if value is not None}
+    if "duration" in given:
+        given["duration_s"] = given.pop("duration")
+    if preset or up or down:
+        given["up"], given["down"] = parse_link(preset, up, down)
+    variants = {name: replace(variant, **given) for name, variant in scenario.variants.items()}
+    return replace(scenario, **given, variants=variants)
+
+
+@cli.command()
+@click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
+def scenarios(as_json: bool) -> None:
+    """List the stored scenarios."""
+    titles = {name: load_scenario(name).title for name in stored_scenarios()}
+    if as_json:
+        print_json(titles)
+        return
+    _print_pairs(list(titles.items()))
+
+
+def _print_pairs(pairs: Sequence[tuple[str, str]]) -> None:
+    width = max(len(name) for name, _ in pairs)
+    for name, text in pairs:
+        click.echo(f"{name:<{width}}  {text}")
+
+
+def main() -> None:
+    """Run the ``sitl`` command."""
+    run(cli, "sitl")
+
+
+if __name__ == "__main__":
+    main()

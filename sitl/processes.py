@@ -1,0 +1,249 @@
+"""The three programs of a flight as operating-system processes: started, listened to, ended, mourned.
+
+Each process streams its records over a loopback TCP connection (:mod:`autopilot.link.stream`), which is
+also its lifeline: closing our half ends it, and it ends by itself when we are gone. Its standard error
+goes to a file, whose end is its last words.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import secrets
+import selectors
+import socket
+import subprocess
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from hmac import compare_digest
+from pathlib import Path
+from time import monotonic  # noqa: TID251  a supervisor of processes waits in real time
+from typing import Any
+
+import orjson
+
+from autopilot.link.node import Record
+from autopilot.link.record import MAX_LINE_BYTES, decode_line
+from autopilot.link.stream import TOKEN_VARIABLE
+from autopilot.link.udp import Address
+
+__all__ = ["ChildDied", "Supervisor"]
+
+READ_BYTES = 1 << 18
+HELLO_TIMEOUT_S = 30.0
+STOP_TIMEOUT_S = 5.0
+MAX_LAST_WORDS = 2000
+
+if sys.platform == "win32":
+    _OWN_GROUP: dict[str, Any] = {"creationflags": subprocess.CREATE_NEW_PROCESS_GROUP}
+else:
+    _OWN_GROUP: dict[str, Any] = {"start_new_session": True}
+"""Ctrl-C in the terminal reaches the supervisor alone, which then ends the others in order."""
+
+
+class ChildDied(Exception):
+    """A process ended that should not have.
+
+    Attributes
+    ----------
+    name : str
+        Which.
+    code : int
+        Its exit code; negative for a signal.
+    last_words : str
+        The end of its standard error.
+    """
+
+    def __init__(self, name: str, code: int, last_words: str) -> None:
+        how = f"signal {-code}" if code < 0 else f"exit code {code}"
+        super().__init__(f"{name} died ({how}): {last_words or 'it said nothing'}")
+        self.name = name
+        self.code = code
+        self.last_words = last_words
+
+
+@dataclass(slots=True)
+class _Child:
+    """One process."""
+
+    name: str
+    process: subprocess.Popen[bytes]
+    log: Path
+    connection: socket.socket | None = None
+    ports: dict[str, Address] = field(default_factory=dict)
+    ended: bool = False
+
+
+@dataclass(slots=True)
+class _Connection:
+    """One stream: unauthenticated until its hello."""
+
+    socket: socket.socket
+    child: _Child | None = None
+    buffer: bytearray = field(default_factory=bytearray)
+
+
+class Supervisor:
+    """Starts the programs, passes on their records, and ends them.
+
+    Parameters
+    ----------
+    folder : Path
+        Where the programs' standard error goes, as ``NAME.log``.
+    write : callable
+        Takes each record and its true time.
+    """
+
+    def __init__(self, folder: Path, write: Callable[[Record, int], None]) -> None:
+        self.malformed = 0
+        self._folder = folder
+        self._write = write
+        self._token = secrets.token_hex(16)
+        self._children: dict[str, _Child] = {}
+        self._selector = selectors.DefaultSelector()
+        self._listener = socket.create_server(("127.0.0.1", 0))
+        self._listener.setblocking(False)
+        self._selector.register(self._listener, selectors.EVENT_READ)
+        self._stopping = False
+
+    def start(self, name: str, arguments: Sequence[str]) -> None:
+        """Start ``python -m`` with the arguments, its record stream joined to ours."""
+        host, port = self._listener.getsockname()
+        log = self._folder / f"{name}.log"
+        command = [sys.executable, "-m", *arguments, "--stream", f"{host}:{port}"]
+        with log.open("wb") as stderr:
+            process = subprocess.Popen(
+                command,
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                stderr=stderr,
+                env={**os.environ, TOKEN_VARIABLE: self._token},
+                **_OWN_GROUP,
+            )
+        self._children[name] = _Child(name, process, log)
+
+    def wait_ready(self, name: str, stopping: Callable[[], bool]) -> dict[str, Address]:
+        """Wait until a program has bound its ports, and return them; empty when stopped before.
+
+        Raises
+        ------
+        ChildDied
+            When it ends instead, or says nothing for too long.
+        """
+        child = self._children[name]
+        deadline = monotonic() + HELLO_TIMEOUT_S
+        while child.connection is None and not stopping():
+            if monotonic() > deadline:
+                child.process.kill()
+                raise ChildDied(name, child.process.wait(), "it did not report in time")
+            self.poll(0.05)
+        return child.ports
+
+    def poll(self, timeout_s: float) -> None:
+        """Pass on what has come, waiting at most ``timeout_s`` for it.
+
+        Raises
+        ------
+        ChildDied
+            When a program has ended by itself.
+        """
+        for key, _ in self._selector.select(timeout_s):
+            if key.fileobj is self._listener:
+                self._accept()
+            else:
+                self._read(key.data)
+        if not self._stopping:
+            for child in self._children.values():
+                code = child.process.poll()
+                if code is not None:
+                    raise ChildDied(child.name, code, self._last_words(child))
+
+    def stop(self) -> list[str]:
+        """End the programs, take their last records, and return the names of those that had to be killed."""
+        self._stopping = True
+        for child in self._children.values():
+            if child.connection is None:
+                child.process.terminate()
+                continue
+            with contextlib.suppress(OSError):  # it is gone already
+                child.connection.shutdown(socket.SHUT_WR)
+        deadline = monotonic() + STOP_TIMEOUT_S
+        while monotonic() < deadline and not all(c.ended or c.connection is None for c in self._children.values()):
+            self.poll(0.05)
+        killed = []
+        for child in self._children.values():
+            try:
+                child.process.wait(max(0.1, deadline - monotonic()))
+            except subprocess.TimeoutExpired:
+                child.process.kill()
+                child.process.wait()
+                killed.append(child.name)
+        return killed
+
+    def close(self) -> None:
+        """Kill what still runs and close the sockets."""
+        for child in self._children.values():
+            if child.process.poll() is None:
+                child.process.kill()
+                child.process.wait()
+        for key in list(self._selector.get_map().values()):
+            assert isinstance(key.fileobj, socket.socket)
+            key.fileobj.close()
+        self._selector.close()
+
+    def _accept(self) -> None:
+        with contextlib.suppress(BlockingIOError):
+            connection, _ = self._listener.accept()
+            connection.setblocking(False)
+            self._selector.register(connection, selectors.EVENT_READ, _Connection(connection))
+
+    def _read(self, connection: _Connection) -> None:
+        """Take the lines that have come; drop a stream that ends or breaks the rules."""
+        try:
+            chunk = connection.socket.recv(READ_BYTES)
+        except BlockingIOError:
+            return
+        except OSError:
+            chunk = b""
+        connection.buffer += chunk
+        *lines, rest = connection.buffer.split(b"\n")
+        connection.buffer = bytearray(rest)
+        for line in lines:
+            if connection.child is None:
+                if not self._hello(connection, bytes(line)):
+                    self._drop(connection)
+                    return
+                continue
+            try:
+                self._write(*decode_line(bytes(line)))
+            except ValueError:
+                self.malformed += 1
+        if not chunk or len(rest) > MAX_LINE_BYTES:
+            self._drop(connection)
+
+    def _hello(self, connection: _Connection, line: bytes) -> bool:
+        """Whether the first line names one of our programs and knows the token."""
+        try:
+            hello = orjson.loads(line)
+            child = self._children[hello["hello"]]
+            known = compare_digest(str(hello["token"]), self._token)
+            ports = {str(name): (str(host), int(port)) for name, (host, port) in hello["ports"].items()}
+        except (ValueError, KeyError, TypeError, AttributeError):
+            return False
+        if not known or child.connection is not None:
+            return False
+        child.connection, child.ports, connection.child = connection.socket, ports, child
+        return True
+
+    def _drop(self, connection: _Connection) -> None:
+        self._selector.unregister(connection.socket)
+        connection.socket.close()
+        if connection.child is not None:
+            connection.child.ended = True
+
+    def _last_words(self, child: _Child) -> str:
+        """Return the end of what a program wrote to standard error, as one line."""
+        text = child.log.read_bytes()[-MAX_LAST_WORDS:].decode("utf-8", errors="replace")
+        lines = [line.strip() for line in text.splitlines() if line.strip()]
+        return lines[-1] if lines else ""

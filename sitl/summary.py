@@ -1,0 +1,230 @@
+"""What a flight came to: the numbers of ``sitl fly --json``, the checks that decide, the table for a person."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from rich.table import Table as Grid
+from rich.text import Text
+
+from autopilot.failsafe import Mode
+from sitl.flightdata import FlightData
+from sitl.scenario import Check, Scenario
+
+__all__ = ["LATE_NS", "Verdict", "delay_summary", "judge", "link_summary", "summarise", "summary_table"]
+
+LATE_NS = 1_000_000
+"""A sample served more than a millisecond after its instant counts as late."""
+
+REENTRY_S = 2.0
+"""How long after a re-entry to TRACKING its saturation is looked at."""
+
+MAX_BARS = 6
+"""Delays that the table lists one by one."""
+
+Kept = tuple[str, int, Mapping[str, Any]]
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """A check and what came out.
+
+    Attributes
+    ----------
+    check : Check
+        The claim.
+    value : object
+        The metric's value; None when the summary has none.
+    passed : bool
+        Whether it is a number within the bounds, or the text that was wanted.
+    """
+
+    check: Check
+    value: object
+    passed: bool
+
+
+def summarise(scenario: Scenario, kept: Sequence[Kept], flight: FlightData, *, virtual: bool) -> dict[str, Any]:
+    """Return the summary of a flight as ``sitl fly --json`` prints it, without files, variants and checks.
+
+    Errors are e = C x + D u - yr, Eq. (10), in the units of the outputs, against the reference model that
+    starts at rest at k = 0 and is never re-initialised: what failsafe costs is in them.
+    """
+    error = np.abs(flight.error[:, 0])
+    last_second = max(1, round(1.0 / scenario.plant.Ts))
+    transitions = [body for topic, _, body in kept if topic == "events" and body["kind"] == "failsafe"]
+    leaving = [t for t in transitions if t["data"]["from"] != Mode.STANDBY]
+    return {
+        "scenario": scenario.name,
+        "title": scenario.title,
+        "gains": scenario.gains.name,
+        "plant": scenario.plant.name,
+        "seed": scenario.seed,
+        "virtual": virtual,
+        "certificate": "none verified",
+        "duration_s": len(flight.time_s) * scenario.plant.Ts,
+        "samples": len(flight.time_s),
+        "diverged": any(topic == "events" and body["kind"] == "diverged" for topic, _, body in kept),
+        "rms_error_rad": float(flight.rms_error[0]),
+        "max_error_rad": float(error.max()),
+        "final_error_rad": float(error[-last_second:].max()),
+        "max_output_rad": float(np.abs(flight.output[:, 0]).max()),
+        "delay": delay_summary(flight),
+        "link": link_summary(kept),
+        "failsafe_events": len(leaving),
+        "failsafe_transitions": [t["text"] for t in transitions],
+        "mode_at_end": flight.modes[-1].mode if flight.modes else Mode.STANDBY.value,
+        "longest_saturation_s": _longest(_at_limit(flight)) * scenario.plant.Ts,
+        "reentry_saturation_s": _reentry_saturation_s(flight),
+        "late_ticks": int(np.count_nonzero(flight.late_ns > LATE_NS)),
+    }
+
+
+def delay_summary(flight: FlightData) -> dict[str, Any]:
+    """Return how long the loop delay was, and how well it was forecast.
+
+    A forecast is scored at the first sample that its command was applied; fractions are of those.
+    """
+    true = flight.d[~np.isnan(flight.d)].astype(int)
+    first: dict[int, int] = {}
+    for k, j in zip(flight.k, flight.j, strict=True):
+        if not np.isnan(j):
+            first.setdefault(int(j), int(k - j))
+    forecasts = dict(zip(flight.command_j.tolist(), flight.forecast.tolist(), strict=True))
+    misses = [forecasts[j] - d for j, d in first.items() if j in forecasts]
+    known = np.array([miss for miss in misses if not np.isnan(miss)])
+    return {
+        "true_histogram": {str(d): n for d, n in sorted(Counter(true.tolist()).items())},
+        "estimated_exact_fraction": float(np.mean(known == 0)) if known.size else None,
+        "within_one_fraction": float(np.mean(np.abs(known) <= 1)) if known.size else None,
+        "unknown_fraction": float(np.mean(np.isnan(flight.forecast))) if flight.forecast.size else None,
+    }
+
+
+def link_summary(kept: Iterable[Kept]) -> dict[str, dict[str, int]]:
+    """Return the packet counts of each direction; ``sent`` counts each packet once, the others its copies."""
+    summary = {}
+    for way in ("up", "down"):
+        summary[way] = dict.fromkeys(("sent", "delivered", "lost", "duplicated", "reordered"), 0)
+    newest = {"up": 0, "down": 0}
+    for topic, _, body in kept:
+        if not topic.startswith("link/"):
+            continue
+        way = topic.removeprefix("link/")
+        counts = summary[way]
+        counts["duplicated" if body["copy"] else "sent"] += 1
+        if body["delivered_ns"] is None:
+            counts["lost"] += 1
+            continue
+        counts["delivered"] += 1
+        if body["number"] < newest[way]:
+            counts["reordered"] += 1
+        newest[way] = max(newest[way], body["number"])
+    return summary
+
+
+def judge(checks: Iterable[Check], summary: Mapping[str, Any]) -> list[Verdict]:
+    """Return the verdict of each check; a flight that diverged fails a check of its own."""
+    survived = Verdict(Check("the aircraft stays in the sky", "diverged"), summary["diverged"], not summary["diverged"])
+    return [survived, *(_judge(check, summary) for check in checks)]
+
+
+def _judge(check: Check, summary: Mapping[str, Any]) -> Verdict:
+    value: Any = summary
+    for key in check.metric.split("."):
+        value = value.get(key) if isinstance(value, Mapping) else None
+    if check.equals is not None:
+        return Verdict(check, value, value == check.equals)
+    number = isinstance(value, int | float) and not np.isnan(value)
+    low = -np.inf if check.at_least is None else check.at_least
+    high = np.inf if check.at_most is None else check.at_most
+    return Verdict(check, value, bool(number and low <= value <= high))
+
+
+def _at_limit(flight: FlightData) -> np.ndarray:
+    """Return where the actuator stands at an end of its travel; shape (N,)."""
+    actuator = flight.model.actuator
+    if actuator is None or actuator.low is None or actuator.high is None:
+        return np.zeros(len(flight.time_s), dtype=bool)
+    slack = 1e-9 * (actuator.high - actuator.low)
+    return np.asarray(np.any((flight.u <= actuator.low + slack) | (flight.u >= actuator.high - slack), axis=1))
+
+
+def _longest(flags: np.ndarray) -> int:
+    """Return the length of the longest run of True."""
+    longest = run = 0
+    for flag in flags.tolist():
+        run = run + 1 if flag else 0
+        longest = max(longest, run)
+    return longest
+
+
+def _reentry_saturation_s(flight: FlightData) -> float | None:
+    """Return the longest saturation in the seconds after any re-entry to TRACKING; None without re-entry."""
+    begins = [interval.start_s for interval in flight.modes if interval.mode == Mode.TRACKING][1:]
+    if not begins:
+        return None
+    at_limit = _at_limit(flight)
+    return (
+        max(_longest(at_limit[(flight.time_s >= begin) & (flight.time_s < begin + REENTRY_S)]) for begin in begins)
+        * flight.model.Ts
+    )
+
+
+def summary_table(summary: Mapping[str, Any], verdicts: Sequence[Verdict]) -> Grid:
+    """Return the table a person reads after the flight."""
+    grid = Grid(show_header=False, title=f"{summary['scenario']}: {summary['title']}", title_justify="left")
+    grid.add_column(no_wrap=True)
+    grid.add_column()
+    delay = summary["delay"]
+    grid.add_row("flight", f"{summary['samples']} samples, {summary['duration_s']:g} s, seed {summary['seed']}")
+    grid.add_row("gains", f"{summary['gains']} on {summary['plant']} (certificate: {summary['certificate']})")
+    rms, peak, final = (np.degrees(summary[f"{m}_error_rad"]) for m in ("rms", "max", "final"))
+    grid.add_row("tracking error", f"rms {rms:.3g}°, largest {peak:.3g}°, last second {final:.3g}°")
+    grid.add_row("true delay", _histogram_text(delay["true_histogram"]))
+    grid.add_row("forecast", _forecast_text(delay))
+    for way, counts in summary["link"].items():
+        grid.add_row(f"link {way}", "  ".join(f"{name} {n}" for name, n in counts.items()))
+    grid.add_row("failsafe", f"{summary['failsafe_events']} transitions, {summary['mode_at_end']} at the end")
+    grid.add_row("late samples", f"{summary['late_ticks']} by more than 1 ms")
+    for name, variant in summary.get("variants", {}).items():
+        peak = np.degrees(variant["max_error_rad"])
+        grid.add_row(f"beside: {name}", f"largest error {peak:.3g}°, {variant['mode_at_end']} at the end")
+    for problem in summary.get("problems", []):
+        grid.add_row("recording", Text(problem, "red"))
+    for verdict in verdicts:
+        mark = Text("passed ", "green") if verdict.passed else Text("FAILED ", "bold red")
+        grid.add_row("check", mark + Text(f"{verdict.check.name}: {_claim(verdict)}"))
+    for name, path in summary.get("files", {}).items():
+        grid.add_row(name, str(path))
+    return grid
+
+
+def _histogram_text(histogram: Mapping[str, int]) -> str:
+    """Return the counts of the delays; of a long tail only its sum and its end."""
+    shown = [f"d={d}: {n}" for d, n in list(histogram.items())[:MAX_BARS]]
+    tail = list(histogram.items())[MAX_BARS:]
+    if tail:
+        shown.append(f"d={tail[0][0]}..{tail[-1][0]}: {sum(n for _, n in tail)}")
+    return "  ".join(shown) or "no command arrived"
+
+
+def _forecast_text(delay: Mapping[str, Any]) -> str:
+    if delay["estimated_exact_fraction"] is None:
+        return "none scored"
+    exact, near = delay["estimated_exact_fraction"], delay["within_one_fraction"]
+    return f"exact {exact:.1%}, within one sample {near:.1%}, unknown {delay['unknown_fraction']:.1%}"
+
+
+def _claim(verdict: Verdict) -> str:
+    """Return metric, value and bounds in one line."""
+    check, value = verdict.check, verdict.value
+    shown = f"{value:.4g}" if isinstance(value, float) else str(value)
+    wanted = [f"= {check.equals}"] if check.equals is not None else []
+    wanted += [f"≥ {check.at_least:g}"] if check.at_least is not None else []
+    wanted += [f"≤ {check.at_most:g}"] if check.at_most is not None else []
+    return f"{check.metric} = {shown}" + (f" (wanted {' and '.join(wanted)})" if wanted else "")
