@@ -11,13 +11,12 @@ from typing import Literal
 
 import numpy as np
 
-from autopilot.clocksync import ClockStatus, ClockSync
-from autopilot.control import limited
+from autopilot.clocksync import ClockSync
+from autopilot.control import law_of
 from autopilot.delay import UNKNOWN, DelayEstimate, DelayEstimator
 from autopilot.failsafe import Event, FailsafeState, Limits, Mode, step
 from autopilot.link.clock import NS_PER_MS, NS_PER_S, NS_PER_US
 from autopilot.link.node import Datagram, Record
-from autopilot.link.servo import travel_of
 from autopilot.link.wire import (
     AUTOPILOT,
     PLANT,
@@ -47,8 +46,6 @@ TIMESYNC_START_NS = 50 * NS_PER_MS
 TIMESYNC_NS = 100 * NS_PER_MS
 SYNC_WAIT_NS = 2 * NS_PER_S
 """A plant that answers no TIMESYNC gets its heartbeat after this time all the same."""
-FUTURE_SLACK_NS = NS_PER_S
-"""A stamp may be later than the plant's estimated time by this much, beyond the estimate's bound."""
 COUNTERS_NS = NS_PER_S
 
 
@@ -80,6 +77,19 @@ class AutopilotConfig:
     ground_stations: int = 1
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Command:
+    """A command as it was sent: what is told of it can wait until it is on its way."""
+
+    at_ns: int
+    sample: Sample
+    forecast: DelayEstimate
+    xr: tuple[float, ...]
+    u: float
+    saturated: bool
+    mode: Mode
+
+
 class AutopilotNode:
     """Node with the ports ``plant`` and ``gcs0``, ``gcs1``, ...
 
@@ -96,9 +106,12 @@ class AutopilotNode:
         self.clock = ClockSync()
         self.delay = DelayEstimator(self.model.Ts_ns)
         self.samples = SampleAssembler(self.model)
-        self.travel = travel_of(self.model)
+        self.law = law_of(config.gains)
+        self.travel = self.law.travel
         self.reference = self._new_reference()
         self.limits = Limits(config.hold_ns)
+        # d_max samples, and a little for clocks that differ
+        self._stale_ns = config.gains.d_max * self.model.Ts_ns + self.model.Ts_ns // 4
         self.failsafe = FailsafeState()
         self.epoch = 0
         self.vehicle = Vehicle(tuple(f"gcs{i}" for i in range(config.ground_stations)), self._banner())
@@ -111,6 +124,7 @@ class AutopilotNode:
         self._next_timesync_ns: int | None = None
         self._next_repeat_ns: int | None = None
         self._next_counters_ns: int | None = None
+        self._untold: list[_Command] = []
         self._out: list[Datagram] = []
         self._records: list[Record] = []
 
@@ -130,7 +144,7 @@ class AutopilotNode:
                 case NamedValueInt():
                     self._named_value(message, now_ns)
                 case VfrHud():
-                    self.vehicle.saw(message, now_ns)
+                    self.vehicle.show(message, now_ns)
                 case _:
                     pass
 
@@ -139,6 +153,11 @@ class AutopilotNode:
         if self._started_ns is None:
             self._started_ns = self._next_timesync_ns = self._next_counters_ns = now_ns
             self._announce_gains(now_ns)
+        untold, self._untold = self._untold, []
+        for command in untold:
+            self._tell(command)
+        if untold and self.reference is not None:
+            self.reference.ahead(self.config.gains.d_max + 1)  # computed while nothing waits for it
         self._tick_plant_link(now_ns)
         self._tick_failsafe(now_ns)
         mode = self.failsafe.mode
@@ -149,20 +168,20 @@ class AutopilotNode:
             self._record_counters(now_ns)
 
     def next_deadline_ns(self) -> int | None:
-        """Return when ``tick`` is wanted; the first call is due at once."""
-        if self._started_ns is None:
+        """Return when ``tick`` is wanted: at once (0) for the first time, and to tell of a command just sent."""
+        if self._started_ns is None or self._untold:
             return 0
-        return min(
-            due
-            for due in (
-                self._next_timesync_ns,
-                self._next_heartbeat_ns,
-                self._next_counters_ns,
-                self._failsafe_deadline_ns(),
-                self.vehicle.next_deadline_ns(),
-            )
-            if due is not None
-        )
+        earliest_ns = self._next_timesync_ns
+        assert earliest_ns is not None
+        for due_ns in (
+            self._next_heartbeat_ns,
+            self._next_counters_ns,
+            self._failsafe_deadline_ns(),
+            self.vehicle.next_deadline_ns(),
+        ):
+            if due_ns is not None and due_ns < earliest_ns:
+                earliest_ns = due_ns
+        return earliest_ns
 
     def outgoing(self) -> list[Datagram]:
         """Take away the datagrams to send, the plant's first."""
@@ -177,15 +196,14 @@ class AutopilotNode:
     # The plant's messages
 
     def _measurement(self, message: Attitude | AoaSsa, now_ns: int) -> None:
-        clock = self.clock.estimate(now_ns)
-        latest_ns = None
-        if clock.status is ClockStatus.LOCKED:
-            latest_ns = now_ns + clock.offset_ns + clock.bound_ns + FUTURE_SLACK_NS
-        sample = self.samples.add(message, now_ns, latest_ns)
+        if type(message) not in self.samples.needed:
+            self.vehicle.show(message, now_ns)
+            return
+        peer_ns = self.clock.peer_at_most_ns(now_ns)
+        sample = self.samples.add(message, now_ns, peer_ns)
         if self.samples.jumped_back and self._plant_restarted():
             self._new_epoch(now_ns)
-            sample = self.samples.add(message, now_ns, latest_ns)
-        self.vehicle.saw(message, now_ns)
+            sample = self.samples.add(message, now_ns, peer_ns)
         if sample is not None:
             self._command(sample, now_ns)
 
@@ -203,12 +221,12 @@ class AutopilotNode:
 
     def _named_value(self, message: NamedValueInt, now_ns: int) -> None:
         if message.name == "SAMPLE_K":
-            sample = self.samples.number(message.value, message.time_boot_ms)
+            sample = self.samples.number(message.value, message.time_boot_ms, self.clock.peer_at_most_ns(now_ns))
             if sample is not None:
                 self._command(sample, now_ns)
         elif message.name == "DELAY_K":
-            self.vehicle.saw(message, now_ns)
-            if message.value > self.config.gains.d_max:
+            self.vehicle.show(message, now_ns)
+            if not self.config.gains.d_min <= message.value <= self.config.gains.d_max:
                 self._failsafe_step(Event.OUTSIDE, f"delay {message.value} reported", now_ns)
 
     def _plant_restarted(self) -> bool:
@@ -236,6 +254,8 @@ class AutopilotNode:
         forecast = self.delay.forecast(sample.t_ns, now_ns)
         inside = forecast.d is not None and gains.d_min <= forecast.d <= gains.d_max
         was = self.failsafe.mode
+        if self._fresh_ns is not None and now_ns - self._fresh_ns > self._stale_ns:
+            self._failsafe_step(Event.STALE, "a gap before this sample", now_ns)
         self._fresh_ns, self._last = now_ns, sample
         reason = "delay unknown" if forecast.d is None else f"delay {forecast.d}"
         self._failsafe_step(Event.GOOD if inside else Event.OUTSIDE, reason, now_ns)
@@ -244,32 +264,37 @@ class AutopilotNode:
             if self.failsafe.mode is Mode.TRACKING and was in (Mode.HOLD, Mode.NEUTRAL):
                 self._match_reference(sample)
         ahead = forecast.d if forecast.d is not None else gains.d_min
-        xr = self.reference.ahead(ahead) if self.reference is not None else None
+        xr = self.reference.ahead(ahead) if self.reference is not None else ()
         saturated = False
         if self.failsafe.mode is Mode.TRACKING or self.config.failsafe == "monitor":
-            self._u, saturated = limited(self.model, self.travel, gains.K1, gains.K2, sample.x, xr)
+            self._u, saturated = self.law.command(sample.x, xr)
         elif self.failsafe.mode is not Mode.HOLD:
             self._u = self.travel.neutral
         self._next_repeat_ns = now_ns + self.model.Ts_ns
-        self._send_command(sample, now_ns)
-        self._record_command(sample, forecast, xr, saturated, now_ns)
+        self._send_command(sample)
+        self._untold.append(_Command(now_ns, sample, forecast, xr, self._u, saturated, self.failsafe.mode))
 
     def _match_reference(self, sample: Sample) -> None:
         """Let the reference go on from where the aircraft is: re-entry without a jump of the elevator."""
         gains = self.config.gains
         if self.reference is None or gains.K2 is None or self.config.failsafe == "monitor":
             return
-        dx = sample.x - self.model.trim.x
-        self.reference.xr = match_reference(self.model, gains.K1, gains.K2, dx, self._u - self.travel.neutral)
+        dx = np.array(sample.x) - self.model.trim.x
+        self.reference.set(match_reference(self.model, gains.K1, gains.K2, dx, self._u - self.travel.neutral))
 
-    def _send_command(self, sample: Sample, now_ns: int) -> None:
+    def _send_command(self, sample: Sample) -> None:
         stamp_us = sample.t_ns // NS_PER_US
-        pulse_us = self.travel.to_pwm(self._u)
         if self.config.actuator == "float":
             self._send(HilActuatorControls(stamp_us, self.travel.to_control(self._u)))
         else:
-            self._send(ServoOutputRaw(stamp_us, pulse_us))
-        self.vehicle.flew(pulse_us, now_ns)
+            self._send(ServoOutputRaw(stamp_us, self.travel.to_pwm(self._u)))
+
+    def _tell(self, command: _Command) -> None:
+        """Show a command to the ground stations, and record it."""
+        for part in command.sample.parts:
+            self.vehicle.show(part, command.at_ns)
+        self.vehicle.show(ServoOutputRaw(0, self.travel.to_pwm(command.u)), command.at_ns)
+        self._record_command(command)
 
     def _new_reference(self) -> ReferenceModel | None:
         if self.model.reference is None:
@@ -310,14 +335,14 @@ class AutopilotNode:
         if self.failsafe.mode is Mode.NEUTRAL and self._last is not None and self.config.failsafe == "on":
             self._u = self.travel.neutral
             self._next_repeat_ns = now_ns + self.model.Ts_ns
-            self._send_command(self._last, now_ns)
+            self._send_command(self._last)
 
     def _failsafe_deadline_ns(self) -> int | None:
         """Return when the present mode ends, or repeats its command, if no sample comes."""
         match self.failsafe.mode:
             case Mode.TRACKING:
                 assert self._fresh_ns is not None
-                return self._fresh_ns + self.config.gains.d_max * self.model.Ts_ns
+                return self._fresh_ns + self._stale_ns
             case Mode.HOLD:
                 return self.failsafe.since_ns + self.limits.hold_ns
             case Mode.NEUTRAL if self.config.failsafe == "on":
@@ -346,7 +371,7 @@ class AutopilotNode:
     def _banner(self) -> list[StatusText]:
         """Return what a ground station must know at start: gains without proof say so."""
         gains = self.config.gains
-        text = f"gains {gains.name}: no verified certificate"
+        text = f"no verified certificate: gains {gains.name}"
         return [StatusText(Severity.WARNING, text)]
 
     def _announce_gains(self, now_ns: int) -> None:
@@ -358,25 +383,24 @@ class AutopilotNode:
         body = {"kind": kind, "node": "autopilot", "text": text, "data": data or {}}
         self._records.append(Record("events", now_ns, body))
 
-    def _record_command(
-        self, sample: Sample, forecast: DelayEstimate, xr: np.ndarray | None, saturated: bool, now_ns: int
-    ) -> None:
+    def _record_command(self, command: _Command) -> None:
+        sample, forecast, xr = command.sample, command.forecast, command.xr
         body = {
             "j": sample.j,
             "sample_ns": sample.t_ns,
             "epoch": self.epoch,
-            "x": sample.x.tolist(),
-            "xr": xr.tolist() if xr is not None else None,
-            "r": [self.config.profile.r(sample.j)] if xr is not None else None,
-            "u": [self._u],
-            "saturated": saturated,
+            "x": sample.x,
+            "xr": xr or None,
+            "r": [self.config.profile.r(sample.j)] if xr else None,
+            "u": [command.u],
+            "saturated": command.saturated,
             "d": forecast.d,
             "d_low": forecast.low,
             "d_high": forecast.high,
             "status": forecast.status,
-            "mode": self.failsafe.mode,
+            "mode": command.mode,
         }
-        self._records.append(Record("autopilot/command", now_ns, body))
+        self._records.append(Record("autopilot/command", command.at_ns, body))
 
     def _record_counters(self, now_ns: int) -> None:
         clock = self.clock.estimate(now_ns)

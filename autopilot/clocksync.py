@@ -150,6 +150,13 @@ class ClockSync:
         status = ClockStatus.LOCKED if interval.exchanges >= MIN_EXCHANGES else ClockStatus.CONVERGING
         return ClockEstimate(interval.middle_ns, (interval.high_ns - interval.low_ns + 1) // 2, status)
 
+    def peer_at_most_ns(self, now_ns: int) -> int | None:
+        """Return what the peer's clock shows at the most; None while not locked."""
+        interval = self._interval
+        if interval is None or interval.exchanges < MIN_EXCHANGES or now_ns - interval.at_ns > STALE_NS:
+            return None
+        return now_ns + interval.high_ns + _drift_ns(now_ns - interval.at_ns)
+
     def _step(self) -> None:
         """Go on from the exchanges that contradicted the interval."""
         assert self._interval is not None

@@ -93,7 +93,11 @@ class DelayEstimator:
             return UNKNOWN
         if now_ns - self._transits[-1][0] > STALE_NS:
             return UNKNOWN
-        low, median, high = (
-            max(1, -(-(now_ns + transit_ns - sample_ns) // self.Ts_ns)) for transit_ns in self._quantiles
+        low, median, high = self._quantiles
+        age_ns, Ts_ns = now_ns - sample_ns, self.Ts_ns
+        return DelayEstimate(
+            max(1, -(-(age_ns + median) // Ts_ns)),
+            max(1, -(-(age_ns + low) // Ts_ns)),
+            max(1, -(-(age_ns + high) // Ts_ns)),
+            DelayStatus.ESTIMATED,
         )
-        return DelayEstimate(median, low, high, DelayStatus.ESTIMATED)

@@ -99,6 +99,7 @@ def step(state: FailsafeState, event: Event, now_ns: int, limits: Limits) -> Fai
     if event is Event.GOOD and good >= limits.good_samples:
         event = Event.RECOVERED
     mode = TRANSITIONS.get((state.mode, event), state.mode)
-    if mode is state.mode:
-        return replace(state, good_in_a_row=min(good, limits.good_samples))
-    return FailsafeState(mode, now_ns, 0)
+    if mode is not state.mode:
+        return FailsafeState(mode, now_ns, 0)
+    good = min(good, limits.good_samples)
+    return state if good == state.good_in_a_row else replace(state, good_in_a_row=good)

@@ -11,6 +11,7 @@ from __future__ import annotations
 import itertools
 import math
 import re
+from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
@@ -103,29 +104,44 @@ class ReferenceModel:
     Attributes
     ----------
     k : int
-        The sample that ``xr`` belongs to.
-    xr : (nr,) array
-        xr(k), zero at k = 0.
+        The sample that the state belongs to; the state is zero at k = 0.
     """
 
     def __init__(self, reference: Reference, profile: Profile) -> None:
         self.reference = reference
         self.profile = profile
         self.k = 0
-        self.xr: Vector = np.zeros(reference.Ar.shape[0])
+        self._states: deque[Vector] = deque([np.zeros(reference.Ar.shape[0])])
+        """xr(k), xr(k + 1), ...: a state looked ahead to is not computed again."""
+
+    @property
+    def xr(self) -> Vector:
+        """The state at sample k."""
+        return self._states[0]
+
+    def set(self, xr: Vector) -> None:
+        """Put the state at sample k elsewhere."""
+        self._states = deque([xr])
 
     def advance(self, j: int) -> Vector:
         """Move the state on to sample j and return xr(j); an earlier sample than the present one moves nothing."""
-        if j > self.k:
-            self.xr = self._propagate(self.xr, self.k, j)
+        while self.k < j and len(self._states) > 1:
+            self._states.popleft()
+            self.k += 1
+        if self.k < j:
+            self.set(self._propagate(self.xr, self.k, j))
             self.k = j
         return self.xr
 
-    def ahead(self, samples: int) -> Vector:
+    def ahead(self, samples: int) -> tuple[float, ...]:
         """Return xr(k + samples) without moving the state."""
-        return self._propagate(self.xr, self.k, self.k + samples)
+        while len(self._states) <= samples:
+            at = self.k + len(self._states) - 1
+            self._states.append(self._propagate(self._states[-1], at, at + 1))
+        return tuple(self._states[samples].tolist())
 
     def _propagate(self, xr: Vector, start: int, end: int) -> Vector:
+        """Return xr(end) from xr(start)."""
         Ar, Br = self.reference.Ar, self.reference.Br[:, 0]
         while start < end:
             until = self.profile.constant_until(start, end)

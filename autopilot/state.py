@@ -12,15 +12,13 @@ that sends none is numbered from the first sample seen.
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 
-import numpy as np
-from numpy.typing import NDArray
-
 from autopilot.link.clock import NS_PER_MS, NS_PER_S, NS_PER_US, unwrap
 from autopilot.link.sensors import Measurement, sensors_of
-from autopilot.link.wire import AoaSsa, Attitude
+from autopilot.link.wire import AoaSsa
 from gains.model import Model
 
 __all__ = ["JUMP_BACK_NS", "Drop", "Sample", "SampleAssembler"]
@@ -35,6 +33,10 @@ JUMP_BACK_NS = NS_PER_S
 """A stamp older than the newest by more than this is no reordering but, with a clock step, a restart."""
 
 
+FUTURE_SLACK_NS = NS_PER_S
+"""A stamp may be later than the plant's time by this much, beyond the bound of the clock estimate."""
+
+
 class Drop(StrEnum):
     """Why a measurement did not become part of a sample."""
 
@@ -43,7 +45,6 @@ class Drop(StrEnum):
     JUMPED_BACK = "jumped_back"
     FROM_THE_FUTURE = "from_the_future"
     HALF = "half"
-    IRRELEVANT = "irrelevant"
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,13 +57,16 @@ class Sample:
         Number of the sample.
     t_ns : int
         Its stamp on the plant's clock.
-    x : (nx,) array
+    x : tuple of float, length nx
         The state, absolute, in the model's units.
+    parts : tuple of Attitude or AoaSsa
+        The messages it was made of.
     """
 
     j: int
     t_ns: int
-    x: NDArray[np.float64]
+    x: tuple[float, ...]
+    parts: tuple[Measurement, ...]
 
 
 @dataclass(slots=True)
@@ -87,6 +91,8 @@ class SampleAssembler:
         Dropped measurements by kind.
     newest_ns : int or None
         Stamp of the newest complete sample.
+    needed : frozenset of type
+        The messages that carry a state.
     jumped_back : bool
         Whether the last stamp was older than the newest sample by more than JUMP_BACK_NS.
     """
@@ -97,11 +103,12 @@ class SampleAssembler:
         self.jumped_back = False
         self._Ts_ns = model.Ts_ns
         self._sensors = sensors_of(model)
-        self._needed = frozenset(sensor.message for sensor in self._sensors)
+        self.needed = frozenset(sensor.message for sensor in self._sensors)
         self._pending: list[_Pending] = []
         self._number: tuple[int, int] | None = None
-        self._waiting: tuple[int, NDArray[np.float64]] | None = None
-        self._wait_since_ns: int | None = None
+        self._waiting: tuple[int, Mapping[type[Measurement], Measurement]] | None = None
+        self._first: tuple[int, int] | None = None
+        """Own time and stamp of the first complete sample of the epoch."""
 
     def restart(self) -> None:
         """Begin a new epoch: forget stamps and numbers, keep the counters."""
@@ -110,25 +117,23 @@ class SampleAssembler:
         self._pending.clear()
         self._number = None
         self._waiting = None
-        self._wait_since_ns = None
+        self._first = None
 
-    def add(self, message: Measurement, now_ns: int, latest_ns: int | None = None) -> Sample | None:
+    def add(self, message: Measurement, now_ns: int, peer_ns: int | None = None) -> Sample | None:
         """Take one measurement; return the sample it completes.
 
         Parameters
         ----------
         message : Attitude or AoaSsa
-            The measurement.
+            The measurement, of a needed type.
         now_ns : int
             Own time.
-        latest_ns : int, optional
-            The plant's time now, at the latest; a stamp after it is refused.
+        peer_ns : int, optional
+            The plant's time now, at the most; a stamp well after it is refused.
         """
-        if type(message) not in self._needed:
-            self.drops[Drop.IRRELEVANT] += 1
-            return None
-        t_ns = self._stamp_ns(message)
-        if latest_ns is not None and t_ns > latest_ns:
+        assert type(message) in self.needed, type(message)
+        t_ns = self._stamp_ns(message, peer_ns)
+        if peer_ns is not None and t_ns > peer_ns + FUTURE_SLACK_NS:
             self.drops[Drop.FROM_THE_FUTURE] += 1
             return None
         half_ns = self._Ts_ns // 2
@@ -142,23 +147,24 @@ class SampleAssembler:
         complete = self._pair(message, t_ns, half_ns)
         return self._numbered(complete, now_ns) if complete is not None else None
 
-    def number(self, k: int, time_boot_ms: int) -> Sample | None:
+    def number(self, k: int, time_boot_ms: int, peer_ns: int | None = None) -> Sample | None:
         """Take the plant's number k of the sample stamped ``time_boot_ms``; return a sample that waited for it."""
-        self._number = (k, self._unwrap_ms(time_boot_ms))
+        self._number = (k, self._unwrap_ms(time_boot_ms, peer_ns))
         if self._waiting is None:
             return None
-        t_ns, x = self._waiting
-        self._waiting = None
-        return Sample(self._j(t_ns), t_ns, x)
+        waiting, self._waiting = self._waiting, None
+        return self._sample(*waiting)
 
-    def _stamp_ns(self, message: Measurement) -> int:
+    def _stamp_ns(self, message: Measurement, peer_ns: int | None) -> int:
         if isinstance(message, AoaSsa):
             return message.time_usec * NS_PER_US
-        return self._unwrap_ms(message.time_boot_ms)
+        return self._unwrap_ms(message.time_boot_ms, peer_ns)
 
-    def _unwrap_ms(self, time_boot_ms: int) -> int:
-        if self.newest_ns is not None:
-            time_boot_ms = unwrap(time_boot_ms, self.newest_ns // NS_PER_MS, 1 << 32)
+    def _unwrap_ms(self, time_boot_ms: int, peer_ns: int | None) -> int:
+        """Return a stamp in ns: the one nearest to the newest sample, or to the plant's time before there is one."""
+        near_ns = self.newest_ns if self.newest_ns is not None else peer_ns
+        if near_ns is not None:
+            time_boot_ms = unwrap(time_boot_ms, near_ns // NS_PER_MS, 1 << 32)
         return time_boot_ms * NS_PER_MS
 
     def _pair(self, message: Measurement, t_ns: int, half_ns: int) -> _Pending | None:
@@ -177,7 +183,7 @@ class SampleAssembler:
                 oldest = min(self._pending, key=lambda p: p.t_ns)
                 self._pending.remove(oldest)
                 self.drops[Drop.HALF] += len(oldest.parts)
-        if len(pending.parts) < len(self._needed):
+        if len(pending.parts) < len(self.needed):
             return None
         for older in [p for p in self._pending if p.t_ns <= pending.t_ns]:
             self._pending.remove(older)
@@ -187,21 +193,23 @@ class SampleAssembler:
 
     def _numbered(self, complete: _Pending, now_ns: int) -> Sample | None:
         """Return a complete sample with its number, or keep it until there is one."""
-        finest = complete.parts.get(AoaSsa) or complete.parts[Attitude]
-        t_ns = self._stamp_ns(finest)
-        x = np.array([getattr(complete.parts[s.message], s.field) / s.to_field for s in self._sensors])
+        finest = complete.parts.get(AoaSsa)
+        t_ns = complete.t_ns if finest is None else self._stamp_ns(finest, None)
         self.newest_ns = t_ns
         if self._number is None:
-            if self._wait_since_ns is None:
-                self._wait_since_ns = now_ns
-            if now_ns - self._wait_since_ns < NUMBER_WAIT_NS:
-                self._waiting = (t_ns, x)
+            if self._first is None:
+                self._first = (now_ns, t_ns)
+            since_ns, first_ns = self._first
+            if now_ns - since_ns < NUMBER_WAIT_NS:
+                self._waiting = (t_ns, complete.parts)
                 return None
-            self._number = (0, t_ns)
-        return Sample(self._j(t_ns), t_ns, x)
+            self._number = (0, first_ns)
+        return self._sample(t_ns, complete.parts)
 
-    def _j(self, t_ns: int) -> int:
-        """Return the number of the sample stamped ``t_ns``; stamps are good to a millisecond."""
+    def _sample(self, t_ns: int, parts: Mapping[type[Measurement], Measurement]) -> Sample:
+        """Return the sample stamped ``t_ns``, numbered; stamps are good to a millisecond."""
         assert self._number is not None
         k, at_ns = self._number
-        return k + round((t_ns - at_ns) / self._Ts_ns)
+        j = k + round((t_ns - at_ns) / self._Ts_ns)
+        x = [getattr(parts[sensor.message], sensor.field) / sensor.to_field for sensor in self._sensors]
+        return Sample(j, t_ns, tuple(x), tuple(parts.values()))

@@ -18,7 +18,6 @@ from autopilot.link.wire import (
     NamedValueInt,
     ServoOutputRaw,
     StatusText,
-    VfrHud,
     Wire,
     autopilot_heartbeat,
 )
@@ -26,6 +25,10 @@ from autopilot.link.wire import (
 __all__ = ["Vehicle"]
 
 HEARTBEAT_NS = NS_PER_S
+MAX_WAITING = 256
+"""Messages that may wait for the next tick; further ones are refused and counted."""
+MAX_TEXTS = 32
+"""Texts that may wait when nothing else may."""
 MAX_BANNER = 8
 """Start-up messages that a ground station is told when it first speaks."""
 
@@ -40,16 +43,21 @@ class Vehicle:
         One port per ground station.
     banner : list of StatusText
         What a ground station is told at start and when it first speaks.
+
+    Attributes
+    ----------
+    refused : int
+        Messages dropped because too many waited.
     """
 
     ports: tuple[str, ...]
     banner: list[StatusText] = field(default_factory=list)
     wires: dict[str, Wire] = field(default_factory=dict)
+    refused: int = 0
     _out: list[Datagram] = field(default_factory=list)
+    _waiting: list[Message] = field(default_factory=list)
     _heard: set[str] = field(default_factory=set)
     _next_heartbeat_ns: int | None = None
-    _attitude: Attitude | None = None
-    _aoa: AoaSsa | None = None
 
     def __post_init__(self) -> None:
         """Open one wire per ground station; any system but our own may speak."""
@@ -64,44 +72,41 @@ class Vehicle:
                 self._out.append((port, self.wires[port].encode(text)))
 
     def tick(self, now_ns: int, *, tracking: bool, degraded: bool) -> None:
-        """Send the heartbeat when it is due, and the banner with the first one."""
+        """Send what waits, and the heartbeat when it is due, with the banner before the first one."""
         if self._next_heartbeat_ns is None:
             self._next_heartbeat_ns = now_ns
             for text in self.banner:
-                self.send(text)
+                self._send(text)
+        waiting, self._waiting = self._waiting, []
+        for message in waiting:
+            self._send(message)
         if now_ns >= self._next_heartbeat_ns:
             self._next_heartbeat_ns += HEARTBEAT_NS
-            self.send(autopilot_heartbeat(tracking=tracking, degraded=degraded))
+            self._send(autopilot_heartbeat(tracking=tracking, degraded=degraded))
 
     def next_deadline_ns(self) -> int | None:
-        """Return when the next heartbeat is due."""
+        """Return when the next heartbeat is due; what waits goes with any earlier tick."""
         return self._next_heartbeat_ns
 
-    def saw(self, message: Message, now_ns: int) -> None:
-        """Take note of a message of the plant and repeat what is shown at once."""
-        if isinstance(message, Attitude):
-            self._attitude = message
-        elif isinstance(message, AoaSsa):
-            self._aoa = message
-        elif isinstance(message, VfrHud):
-            self.send(message)
-        elif isinstance(message, NamedValueInt):
-            self.send(replace(message, time_boot_ms=now_ns // NS_PER_MS))
-
-    def flew(self, pulse_us: int, now_ns: int) -> None:
-        """Show the newest attitude and angle of attack, and the elevator pulse just commanded."""
-        if self._attitude is not None:
-            self.send(replace(self._attitude, time_boot_ms=now_ns // NS_PER_MS))
-        if self._aoa is not None:
-            self.send(replace(self._aoa, time_usec=now_ns // NS_PER_US))
-        self.send(ServoOutputRaw(now_ns // NS_PER_US, pulse_us))
+    def show(self, message: Message, now_ns: int) -> None:
+        """Repeat a message under our name, on our clock, at the next tick."""
+        if isinstance(message, Attitude | NamedValueInt):
+            message = replace(message, time_boot_ms=now_ns // NS_PER_MS)
+        elif isinstance(message, AoaSsa | ServoOutputRaw):
+            message = replace(message, time_usec=now_ns // NS_PER_US)
+        self._wait(message)
 
     def say(self, severity: int, text: str) -> None:
-        """Send a STATUSTEXT to every ground station."""
-        self.send(StatusText(severity, text))
+        """Send a STATUSTEXT to every ground station, at the next tick."""
+        self._wait(StatusText(severity, text), MAX_WAITING + MAX_TEXTS)
 
-    def send(self, message: Message) -> None:
-        """Send a message to every ground station."""
+    def _wait(self, message: Message, limit: int = MAX_WAITING) -> None:
+        if len(self._waiting) < limit:
+            self._waiting.append(message)
+        else:
+            self.refused += 1
+
+    def _send(self, message: Message) -> None:
         for port, wire in self.wires.items():
             self._out.append((port, wire.encode(message)))
 

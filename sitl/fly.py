@@ -168,14 +168,16 @@ def _fly_in_processes(
 ) -> None:
     """Fly over UDP: plant, relay and autopilot as processes of their own."""
     start_ns = true_ns()
-    flown = 0
+    flown, end_ns = 0, 1 << 63
 
     def write(record: Record, at_ns: int) -> None:
-        nonlocal flown
+        nonlocal flown, end_ns
+        if at_ns > end_ns:
+            return  # flown while the programs were being told to end
         if record.topic == "plant/truth":
-            if flown >= scenario.samples:
-                return  # flown while the programs were being told to end
             flown = int(record.body["k"]) + 1
+            if flown == scenario.samples:
+                end_ns = at_ns
         log_time_ns = max(0, at_ns - start_ns)
         recorder.write(record, log_time_ns)
         view.take(record, log_time_ns)

@@ -86,6 +86,9 @@ def constant(latency_ns: int) -> Callable[[int], int | None]:
     return lambda _now_ns: latency_ns
 
 
+TEN_MS = constant(10 * MS)
+
+
 class Flight:
     """Autopilot, line and plant in virtual time; everything they recorded and sent, by true time.
 
@@ -96,8 +99,8 @@ class Flight:
         self,
         config: AutopilotConfig | None = None,
         plant: PlantConfig | None = None,
-        up: Callable[[int], int | None] = constant(10 * MS),
-        down: Callable[[int], int | None] = constant(10 * MS),
+        up: Callable[[int], int | None] = TEN_MS,
+        down: Callable[[int], int | None] = TEN_MS,
         *,
         plant_clock: Clock = PLANT_CLOCK,
         autopilot_clock: Clock = AUTOPILOT_CLOCK,
@@ -150,9 +153,7 @@ class Flight:
     def when(self, kind: str, text: str = "") -> list[int]:
         """Return the true times of the events of a kind whose text contains ``text``."""
         return [
-            t
-            for t, r in self._records
-            if r.topic == "events" and r.body["kind"] == kind and text in r.body["text"]
+            t for t, r in self._records if r.topic == "events" and r.body["kind"] == kind and text in r.body["text"]
         ]
 
     def sent(self, node: str, port: str) -> Iterator[tuple[int, object]]:

@@ -6,6 +6,8 @@ between two passes, the records are passed on, the files are closed.
 
 from __future__ import annotations
 
+import gc
+import re
 import signal
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
@@ -25,6 +27,9 @@ from gains.table import InputError
 __all__ = ["ADDRESS", "CLOCK", "ProcessOptions", "format_clock", "parse_clock", "process_options", "run_node"]
 
 F = TypeVar("F", bound=Callable[..., Any])
+
+
+_CLOCK = re.compile(r"(?P<offset>[0-9]{1,9}(\.[0-9]{1,9})?)s(:(?P<drift>[-+]?[0-9]{1,9}(\.[0-9]{1,9})?)ppm)?")
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,22 +59,17 @@ def parse_clock(text: str) -> Clock:
     InputError
         For anything else, a negative offset, or a drift of 1 % or more.
     """
-    offset, _, drift = text.partition(":")
-    try:
-        if not offset.endswith("s") or (drift and not drift.endswith("ppm")):
-            raise ValueError
-        offset_ns = round(float(offset.removesuffix("s")) * NS_PER_S)
-        drift_ppb = round(float(drift.removesuffix("ppm") or 0.0) * 1000)
-        if offset_ns < 0 or abs(drift_ppb) >= 10_000_000:
-            raise ValueError
-    except (ValueError, OverflowError):
-        raise InputError(f'clock "{text}": expected OFFSETs:DRIFTppm such as 137s:+40ppm') from None
+    match = _CLOCK.fullmatch(text)
+    offset_ns = round(float(match["offset"]) * NS_PER_S) if match else 0
+    drift_ppb = round(float(match["drift"] or 0.0) * 1000) if match else 0
+    if match is None or abs(drift_ppb) >= 10_000_000:
+        raise InputError(f'clock "{text}": expected OFFSETs:DRIFTppm such as 137s:+40ppm')
     return Clock(offset_ns, drift_ppb)
 
 
 def format_clock(clock: Clock) -> str:
     """Return the text that :func:`parse_clock` reads back."""
-    return f"{clock.offset_ns / NS_PER_S!r}s:{clock.drift_ppb / 1000!r}ppm"
+    return f"{clock.offset_ns / NS_PER_S:.9f}s:{clock.drift_ppb / 1000:.3f}ppm"
 
 
 class _Parsed(click.ParamType[Any]):
@@ -173,6 +173,8 @@ def run_node(
             except OSError as error:
                 raise InputError(f"{options.record}: {error.strerror or error}") from None
             sink = _FileSink(recorder)
+        gc.collect()
+        gc.freeze()  # what is loaded now stays: no later collection has to look at it
         driver = UdpDriver(node, ports, options.clock, sink, tap=tap)
         stack.callback(driver.close)
         driver.run(lambda: stopped or (stream is not None and stream.closed))

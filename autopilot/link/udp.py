@@ -15,7 +15,7 @@ from time import perf_counter_ns  # noqa: TID251  a driver reads the clock; this
 from typing import Protocol
 
 from autopilot.link.clock import NS_PER_S, Clock
-from autopilot.link.node import Node, Record
+from autopilot.link.node import Datagram, Node, Record
 from autopilot.link.record import frame_record
 from gains.table import InputError
 
@@ -99,6 +99,7 @@ class UdpPort:
         self._accept = accept
         self._connected = connected
         self._heard_ns: int | None = None
+        self._buffer = memoryview(bytearray(MAX_DATAGRAM))
 
     @property
     def local(self) -> Address:
@@ -109,11 +110,12 @@ class UdpPort:
     def receive(self, now_ns: int) -> bytes | None:
         """Return the next datagram of the peer, b"" for one that was dropped, None when there is none."""
         try:
-            datagram, sender = self.socket.recvfrom(MAX_DATAGRAM)
+            size, sender = self.socket.recvfrom_into(self._buffer)
         except BlockingIOError:
             return None
         except OSError:
             return b""  # an earlier datagram of ours found nobody: no host, no network, or no program there
+        datagram = bytes(self._buffer[:size])
         if not self._connected and not self._is_peer((sender[0], sender[1]), datagram, now_ns):
             self.strangers += 1
             return b""
@@ -230,6 +232,7 @@ class UdpDriver:
         self.node = node
         self.clock = Clock(clock.offset_ns, clock.drift_ppb, true_ns())
         self._ports = list(ports)
+        self._sockets = [port.socket for port in ports]
         self._by_name = {port.name: port for port in ports}
         self._sink = sink
         self._tap = tap and sink is not None
@@ -237,14 +240,15 @@ class UdpDriver:
     def run(self, stopping: Callable[[], bool]) -> None:
         """Serve the node until ``stopping()`` holds."""
         while not stopping():
-            self._wait()
+            ready = self._wait()
             for port in self._ports:
-                self._serve(port)
+                if port.socket in ready:
+                    self._serve(port)
             now_ns = self._now_ns()
             deadline_ns = self.node.next_deadline_ns()
             if deadline_ns is not None and now_ns >= deadline_ns:
                 self.node.tick(now_ns)
-            self._flush()
+            self._record(self._send())
             if self._sink is not None:
                 self._sink.pump()
 
@@ -256,13 +260,13 @@ class UdpDriver:
     def _now_ns(self) -> int:
         return self.clock.node_ns(true_ns())
 
-    def _wait(self) -> None:
-        """Sleep until a datagram comes or the node's deadline, whichever is first."""
+    def _wait(self) -> list[socket.socket]:
+        """Sleep until a datagram comes or the node's deadline, whichever is first; return who has one."""
         deadline_ns = self.node.next_deadline_ns()
         wait_ns = MAX_WAIT_NS
         if deadline_ns is not None:
             wait_ns = min(wait_ns, max(0, self.clock.true_ns(deadline_ns) - true_ns()))
-        select.select([port.socket for port in self._ports], [], [], wait_ns / NS_PER_S)
+        return select.select(self._sockets, [], [], wait_ns / NS_PER_S)[0]
 
     def _serve(self, port: UdpPort) -> None:
         """Hand the node a bounded number of datagrams, sending its answers at once."""
@@ -274,19 +278,27 @@ class UdpDriver:
             if not datagram:
                 continue
             now_ns = self.clock.node_ns(at_ns)
+            self.node.receive(port.name, datagram, now_ns)
+            sent = self._send()
             if self._tap and self._sink is not None:
                 self._sink.write(frame_record(port.name, now_ns, "received", datagram), at_ns)
-            self.node.receive(port.name, datagram, now_ns)
-            self._flush()
+            self._record(sent)
 
-    def _flush(self) -> None:
-        """Send and record what the node has made."""
-        for name, datagram in self.node.outgoing():
+    def _send(self) -> list[Datagram]:
+        """Send what the node has for the network, and return it."""
+        outgoing = self.node.outgoing()
+        for name, datagram in outgoing:
             self._by_name[name].send(datagram)
-            if self._tap and self._sink is not None:
-                at_ns = true_ns()
-                record = frame_record(name, self.clock.node_ns(at_ns), "sent", datagram)
-                self._sink.write(record, at_ns)
-        for record in self.node.records():
-            if self._sink is not None:
-                self._sink.write(record, self.clock.true_ns(record.t_ns))
+        return outgoing
+
+    def _record(self, sent: list[Datagram]) -> None:
+        """Record what was sent and what the node has made."""
+        records = self.node.records()
+        if self._sink is None:
+            return
+        if self._tap and sent:
+            at_ns = true_ns()
+            for name, datagram in sent:
+                self._sink.write(frame_record(name, self.clock.node_ns(at_ns), "sent", datagram), at_ns)
+        for record in records:
+            self._sink.write(record, self.clock.true_ns(record.t_ns))

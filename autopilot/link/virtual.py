@@ -6,7 +6,7 @@ sequence. Nothing else decides, so a flight is the same bytes for the same seed.
 
 from __future__ import annotations
 
-import heapq
+from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -63,47 +63,62 @@ class VirtualNetwork:
         self._sink = sink
         self._tap = tap
         self._tapped = [p.name in tapped and tap is not None for p in self._participants]
-        self._deliveries: list[tuple[int, int, int, str, bytes]] = []
-        self._sequence = 0
-        self._due: list[int | None] = [self._next_due(i) for i in range(len(self._participants))]
+        self._deliveries: list[deque[tuple[str, bytes]]] = [deque() for _ in self._participants]
+        self._deadlines: list[int | None] = [None] * len(self._participants)
+        self._due: list[int | None] = [None] * len(self._participants)
+        for i in range(len(self._participants)):
+            self._schedule(i)
 
     def replace(self, name: str, node: Node, clock: Clock) -> None:
         """Boot a new node under an old name, as after a crash: datagrams under way still arrive."""
         i = self._index[name]
         self._participants[i] = Participant(name, node, clock)
-        self._due[i] = self._next_due(i)
+        self._deadlines[i] = self._due[i] = None
+        self._schedule(i)
 
     def run(self, until: Callable[[], bool], limit_ns: int) -> None:
         """Fly until ``until()`` holds or true time passes ``limit_ns``."""
         while not until():
-            instant = self._earliest()
-            if instant is None or instant > limit_ns:
+            if self._deliver():
+                continue
+            i = self._earliest()
+            due_ns = self._due[i]
+            if due_ns is None or due_ns > limit_ns:
                 self.now_ns = max(self.now_ns, limit_ns)
                 return
-            self.now_ns = instant
-            if self._deliveries and self._deliveries[0][0] <= instant:
-                _, i, _, port, datagram = heapq.heappop(self._deliveries)
-                p = self._participants[i]
-                if self._tapped[i]:
-                    self._tap(p.name, port, "received", datagram, instant)  # type: ignore[misc]
-                p.node.receive(port, datagram, p.clock.node_ns(instant))
-            else:
-                i = next(i for i, due in enumerate(self._due) if due is not None and due <= instant)
-                p = self._participants[i]
-                p.node.tick(p.clock.node_ns(instant))
+            self.now_ns = max(self.now_ns, due_ns)
+            p = self._participants[i]
+            p.node.tick(p.clock.node_ns(self.now_ns))
             self._collect(i)
 
-    def _earliest(self) -> int | None:
-        earliest = self._deliveries[0][0] if self._deliveries else None
-        for due in self._due:
-            if due is not None and (earliest is None or due < earliest):
-                earliest = due
-        return None if earliest is None else max(self.now_ns, earliest)
+    def _deliver(self) -> bool:
+        """Hand over what is under way to the first node that has something; wires take no time."""
+        for i, waiting in enumerate(self._deliveries):
+            if waiting:
+                port, datagram = waiting.popleft()
+                p = self._participants[i]
+                if self._tapped[i]:
+                    self._tap(p.name, port, "received", datagram, self.now_ns)  # type: ignore[misc]
+                p.node.receive(port, datagram, p.clock.node_ns(self.now_ns))
+                self._collect(i)
+                return True
+        return False
 
-    def _next_due(self, i: int) -> int | None:
+    def _earliest(self) -> int:
+        """Return the node whose tick is due first, the first of equals."""
+        earliest, first_ns = 0, self._due[0]
+        for i, due_ns in enumerate(self._due):
+            if due_ns is not None and (first_ns is None or max(due_ns, self.now_ns) < max(first_ns, self.now_ns)):
+                earliest, first_ns = i, due_ns
+        return earliest
+
+    def _schedule(self, i: int) -> None:
+        """Ask a node for its deadline, and map it to true time when it is a new one."""
         p = self._participants[i]
         deadline_ns = p.node.next_deadline_ns()
-        return None if deadline_ns is None else p.clock.true_ns(deadline_ns)
+        if deadline_ns != self._deadlines[i]:
+            self._deadlines[i] = deadline_ns
+            self._due[i] = None if deadline_ns is None else p.clock.true_ns(deadline_ns)
 
     def _collect(self, i: int) -> None:
         """Take what a node has sent and recorded, and its new deadline."""
@@ -113,10 +128,9 @@ class VirtualNetwork:
                 self._tap(p.name, port, "sent", datagram, self.now_ns)  # type: ignore[misc]
             far = self._wires.get((i, port))
             if far is not None:
-                heapq.heappush(self._deliveries, (self.now_ns, far[0], self._sequence, far[1], datagram))
-                self._sequence += 1
+                self._deliveries[far[0]].append((far[1], datagram))
         records = p.node.records()
         if self._sink is not None:
             for record in records:
                 self._sink(record, p.clock.true_ns(record.t_ns))
-        self._due[i] = self._next_due(i)
+        self._schedule(i)

@@ -1,0 +1,180 @@
+"""The reference model against scipy, and its profile."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.signal import dlsim
+
+from autopilot import reference as reference_module
+from autopilot.reference import Profile, ReferenceModel, match_reference, parse_profile
+from gains.table import InputError
+from tests.helpers import HIRM
+
+quick = settings(deadline=None)
+REFERENCE = HIRM.model.reference
+SWITCHES = st.lists(st.integers(0, 400), max_size=5, unique=True).flatmap(
+    lambda starts: st.lists(st.floats(-1.0, 1.0), min_size=len(starts), max_size=len(starts)).map(
+        lambda values: Profile(tuple(zip(sorted(starts), values, strict=True)))
+    )
+)
+
+
+def by_scipy(r: np.ndarray) -> np.ndarray:
+    """Return xr(0), xr(1), ... of Eq. (8) as scipy simulates it."""
+    n = REFERENCE.Ar.shape[0]
+    _, _, xr = dlsim((REFERENCE.Ar, REFERENCE.Br, REFERENCE.Cr, np.zeros((1, 1)), 1.0), r[:, None], x0=np.zeros(n))
+    return xr
+
+
+def test_a_step_is_what_scipy_makes_of_it():
+    model = ReferenceModel(REFERENCE, Profile(((40, 1.0),)))
+    truth = by_scipy(np.where(np.arange(400) >= 40, 1.0, 0.0))
+    for k in range(400):
+        np.testing.assert_allclose(model.advance(k), truth[k], rtol=1e-11, atol=1e-13)
+
+
+def test_the_papers_reference_model_settles_at_unit_gain_in_pitch():
+    model = ReferenceModel(REFERENCE, Profile(((0, 1.0),)))
+    assert (REFERENCE.Cr @ model.advance(20_000))[0] == pytest.approx(1.0, abs=0.02)
+
+
+@quick
+@given(SWITCHES, st.lists(st.integers(0, 500), min_size=1, max_size=10), st.integers(0, 40))
+def test_any_profile_any_gaps_and_any_lookahead_match_scipy(profile, stops, samples):
+    truth = by_scipy(np.array([profile.r(k) for k in range(600)]))
+    model = ReferenceModel(REFERENCE, profile)
+    for j in sorted(stops):
+        np.testing.assert_allclose(model.advance(j), truth[j], rtol=1e-10, atol=1e-12)
+        np.testing.assert_allclose(model.ahead(samples), truth[j + samples], rtol=1e-10, atol=1e-12)
+
+
+@pytest.mark.parametrize("end", [63, 64, 65, 66, 500, 100_000])
+def test_one_matrix_power_is_as_good_as_the_loop(monkeypatch, end):
+    profile = Profile(((3, 1.0),))
+    by_power = ReferenceModel(REFERENCE, profile).advance(end)
+    monkeypatch.setattr(reference_module, "LOOP_LIMIT", 10**9)
+    by_loop = ReferenceModel(REFERENCE, profile).advance(end)
+    np.testing.assert_allclose(by_power, by_loop, rtol=1e-12, atol=1e-12)
+
+
+def test_looking_ahead_does_not_move_the_state():
+    model = ReferenceModel(REFERENCE, Profile(((0, 1.0),)))
+    before = model.advance(7).copy()
+    model.ahead(100)
+    assert model.k == 7
+    np.testing.assert_array_equal(model.xr, before)
+    np.testing.assert_array_equal(model.ahead(0), before)
+
+
+def test_an_earlier_sample_moves_nothing():
+    model = ReferenceModel(REFERENCE, Profile(((0, 1.0),)))
+    before = model.advance(7).copy()
+    np.testing.assert_array_equal(model.advance(3), before)
+    assert model.k == 7
+
+
+def test_a_billion_lost_samples_cost_no_time():
+    model = ReferenceModel(REFERENCE, Profile(((0, 1.0),)))
+    assert np.all(np.isfinite(model.advance(10**9)))
+
+
+# the profile
+
+
+@pytest.mark.parametrize(
+    ("text", "switches"),
+    [
+        ("", ()),
+        (" , ", ()),
+        ("5deg@1s", ((40, math.radians(5.0)),)),
+        ("5deg@1s,0deg@6s", ((40, math.radians(5.0)), (240, 0.0))),
+        (" 5deg@1s , -2.5deg@2s ", ((40, math.radians(5.0)), (80, math.radians(-2.5)))),
+        ("0.1rad@0s", ((0, 0.1),)),
+        ("1@0.075s", ((3, 1.0),)),
+        ("1@0.0751s", ((4, 1.0),)),
+        ("+1e-1@1e1s", ((400, 0.1),)),
+    ],
+)
+def test_profiles_are_read(text, switches):
+    assert parse_profile(text, 0.025).switches == switches
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "5",
+        "5deg",
+        "5deg@",
+        "5deg@1",
+        "@1s",
+        "deg@1s",
+        "5grad@1s",
+        "5deg@-1s",
+        "5deg@1s;0deg@2s",
+        "nan@1s",
+        "inf@1s",
+        "1e999@1s",
+        "1@1e999s",
+        "1-1@1s",
+        "5deg@1s,x",
+        "5 deg@1s",
+    ],
+)
+def test_what_is_no_profile_is_refused(text):
+    with pytest.raises(InputError, match=r'reference ".*": expected VALUE@TIMEs such as 5deg@1s, found'):
+        parse_profile(text, 0.025)
+
+
+@pytest.mark.parametrize("text", ["1@2s,2@1s", "1@1s,2@1s", "1@1.001s,2@1.002s"])
+def test_times_must_rise(text):
+    with pytest.raises(InputError, match="expected rising times"):
+        parse_profile(text, 0.025)
+
+
+@quick
+@given(st.integers(0, 3_000_000), st.sampled_from([0.004, 0.02, 0.025, 0.03, 1 / 30]))
+def test_a_switch_at_a_samples_own_time_is_that_sample(k, Ts):
+    assert parse_profile(f"1@{k * Ts!r}s", Ts).switches == ((k, 1.0),)
+
+
+@quick
+@given(SWITCHES, st.integers(0, 500), st.integers(1, 100))
+def test_r_is_constant_as_long_as_it_says(profile, k, span):
+    until = profile.constant_until(k, k + span)
+    assert k < until <= k + span
+    assert len({profile.r(i) for i in range(k, until)}) == 1
+    assert until == k + span or until in [start for start, _ in profile.switches]
+
+
+# re-entry
+
+
+@quick
+@given(
+    st.lists(st.floats(-0.3, 0.3), min_size=3, max_size=3).map(np.array),
+    st.floats(-0.4, 0.4),
+)
+def test_a_matched_reference_has_the_aircrafts_output_and_its_input(x, u):
+    xr = match_reference(HIRM.model, HIRM.K1, HIRM.K2, x, u)
+    np.testing.assert_allclose(REFERENCE.Cr @ xr, HIRM.model.C @ x, atol=1e-9)
+    np.testing.assert_allclose(HIRM.K2 @ xr, u - HIRM.K1 @ x, atol=1e-9)
+
+
+def test_a_matched_reference_stays_nearest_to_the_state():
+    x, u = np.array([0.02, -0.1, 0.05]), 0.03
+    xr = match_reference(HIRM.model, HIRM.K1, HIRM.K2, x, u)
+    rows = np.vstack([REFERENCE.Cr, HIRM.K2])
+    free = np.linalg.svd(rows)[2][2]
+    np.testing.assert_allclose(rows @ free, 0.0, atol=1e-12)
+    assert abs(free @ (xr - x)) < 1e-9
+
+
+def test_a_reference_that_matches_already_is_left_alone():
+    x = np.array([0.02, -0.1, 0.05])
+    u = float((HIRM.K1 @ x + HIRM.K2 @ x)[0])
+    np.testing.assert_allclose(match_reference(HIRM.model, HIRM.K1, HIRM.K2, x, u), x, atol=1e-12)

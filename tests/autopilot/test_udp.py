@@ -1,0 +1,398 @@
+"""The UDP driver on the loopback: one peer per port, no error for a peer that is not there, no starving."""
+
+from __future__ import annotations
+
+import errno
+import select
+import socket
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
+from dataclasses import dataclass, field
+
+import pytest
+
+from autopilot.link import udp
+from autopilot.link.clock import NS_PER_S, Clock
+from autopilot.link.node import Record
+from autopilot.link.udp import (
+    LATCH_SILENCE_NS,
+    MAX_PER_PASS,
+    UdpDriver,
+    UdpPort,
+    dial,
+    listen,
+    parse_address,
+    true_ns,
+)
+from gains.table import InputError
+
+HOME = ("127.0.0.1", 0)
+TIMEOUT_S = 5.0
+MAX_PASSES = 60
+
+
+@dataclass
+class Probe:
+    """A node that logs, echoes if told to, and sends ``beacon`` at every tick."""
+
+    deadline_ns: int | None = None
+    echo: bool = False
+    beacon: list[tuple[str, bytes]] = field(default_factory=list)
+    got: list[tuple[str, bytes, int]] = field(default_factory=list)
+    ticks: list[int] = field(default_factory=list)
+    out: list[tuple[str, bytes]] = field(default_factory=list)
+    made: list[Record] = field(default_factory=list)
+
+    def receive(self, port, datagram, now_ns):
+        self.got.append((port, datagram, now_ns))
+        if self.echo:
+            self.out.append((port, datagram))
+
+    def tick(self, now_ns):
+        self.ticks.append(now_ns)
+        self.out += self.beacon
+        self.made.append(Record("events", now_ns, {}))
+
+    def next_deadline_ns(self):
+        return self.deadline_ns
+
+    def outgoing(self):
+        out, self.out = self.out, []
+        return out
+
+    def records(self):
+        made, self.made = self.made, []
+        return made
+
+
+@pytest.fixture
+def peer() -> Iterator[socket.socket]:
+    with closing(a_socket()) as sock:
+        yield sock
+
+
+@pytest.fixture
+def stranger() -> Iterator[socket.socket]:
+    with closing(a_socket()) as sock:
+        yield sock
+
+
+def a_socket() -> socket.socket:
+    sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    sock.bind(HOME)
+    sock.settimeout(TIMEOUT_S)
+    return sock
+
+
+def passes(count: int, each: Callable[[int], None] = lambda n: None) -> Callable[[], bool]:
+    """Return a ``stopping`` that lets the driver make so many passes, calling ``each`` before every one."""
+    made = 0
+
+    def stopping() -> bool:
+        nonlocal made
+        if made >= count:
+            return True
+        each(made)
+        made += 1
+        return False
+
+    return stopping
+
+
+def until(condition: Callable[[], bool]) -> Callable[[], bool]:
+    bounded = passes(MAX_PASSES)
+    return lambda: condition() or bounded()
+
+
+def take(port: UdpPort, now_ns: int) -> bytes | None:
+    """Wait for a datagram at a port, and take it."""
+    assert select.select([port.socket], [], [], TIMEOUT_S)[0]
+    return port.receive(now_ns)
+
+
+def accept_hello(datagram: bytes) -> bool:
+    return datagram.startswith(b"hello")
+
+
+@contextmanager
+def deaf() -> Iterator[socket.socket]:
+    """Give a socket that refuses everybody: its port is taken, so nobody else can come to listen there."""
+    with closing(a_socket()) as sock, closing(a_socket()) as elsewhere:
+        sock.connect(elsewhere.getsockname())
+        yield sock
+
+
+# ports
+
+
+@pytest.mark.parametrize(
+    ("text", "address"),
+    [
+        ("127.0.0.1:14600", ("127.0.0.1", 14600)),
+        ("udpout:127.0.0.1:14600", ("127.0.0.1", 14600)),
+        ("udpin:0.0.0.0:0", ("0.0.0.0", 0)),
+        ("[::1]:65535", ("::1", 65535)),
+        ("localhost:1", ("localhost", 1)),
+    ],
+)
+def test_addresses_are_read(text, address):
+    assert parse_address(text) == address
+
+
+@pytest.mark.parametrize("text", ["", "127.0.0.1", ":14600", "127.0.0.1:", "h:65536", "h:-1", "h:x", "h:1.5", "h:٣"])
+def test_what_is_no_address_is_refused(text):
+    with pytest.raises(InputError, match="expected HOST:PORT"):
+        parse_address(text)
+
+
+def test_a_dialling_port_hears_its_one_peer_and_nobody_else(peer, stranger):
+    port = dial("p", peer.getsockname())
+    with closing(port.socket):
+        stranger.sendto(b"forged", port.local)
+        peer.sendto(b"true", port.local)
+        assert take(port, 0) == b"true"
+        assert port.receive(0) is None
+
+
+def test_a_listening_port_latches_the_first_sender_of_an_accepted_datagram(peer, stranger):
+    port = listen("p", HOME, accept=accept_hello)
+    with closing(port.socket):
+        stranger.sendto(b"nonsense", port.local)
+        assert take(port, 1) == b""
+        assert (port.peer, port.strangers) == (None, 1)
+        peer.sendto(b"hello", port.local)
+        assert take(port, 2) == b"hello"
+        assert port.peer == peer.getsockname()
+        peer.sendto(b"anything", port.local)
+        assert take(port, 3) == b"anything"
+        assert port.strangers == 1
+
+
+def test_a_stranger_is_counted_and_not_answered_while_the_peer_speaks(peer, stranger):
+    port = listen("p", HOME, accept=accept_hello)
+    node = Probe(echo=True)
+    with closing(UdpDriver(node, [port], Clock())) as driver:
+        peer.sendto(b"hello", port.local)
+        stranger.sendto(b"hello too", port.local)
+        peer.sendto(b"bye", port.local)
+        driver.run(until(lambda: len(node.got) >= 2))
+        assert [datagram for _, datagram, _ in node.got] == [b"hello", b"bye"]
+        assert (port.strangers, port.peer) == (1, peer.getsockname())
+        assert (peer.recv(99), peer.recv(99)) == (b"hello", b"bye")
+        stranger.setblocking(False)
+        with pytest.raises(BlockingIOError):
+            stranger.recv(99)
+
+
+def test_a_silent_peer_may_be_replaced_just_after_its_time_and_not_before(peer, stranger):
+    port = listen("p", HOME, accept=accept_hello)
+    with closing(port.socket):
+        peer.sendto(b"hello", port.local)
+        take(port, 1000)
+        stranger.sendto(b"hello", port.local)
+        assert take(port, 1000 + LATCH_SILENCE_NS) == b""
+        stranger.sendto(b"nonsense", port.local)
+        assert take(port, 1001 + LATCH_SILENCE_NS) == b""
+        assert port.peer == peer.getsockname()
+        stranger.sendto(b"hello", port.local)
+        assert take(port, 1001 + LATCH_SILENCE_NS) == b"hello"
+        assert port.peer == stranger.getsockname()
+        peer.sendto(b"hello", port.local)
+        assert take(port, 1002 + LATCH_SILENCE_NS) == b""
+
+
+def test_a_strangers_noise_does_not_keep_a_dead_peer_latched(peer, stranger):
+    port = listen("p", HOME, accept=accept_hello)
+    with closing(port.socket):
+        peer.sendto(b"hello", port.local)
+        take(port, 0)
+        for now_ns in range(0, LATCH_SILENCE_NS, NS_PER_S):
+            stranger.sendto(b"hello", port.local)
+            assert take(port, now_ns) == b""
+        stranger.sendto(b"hello", port.local)
+        assert take(port, LATCH_SILENCE_NS + 1) == b"hello"
+
+
+def test_a_port_with_a_given_peer_never_latches_another(peer, stranger):
+    port = listen("p", HOME, peer=peer.getsockname(), accept=accept_hello)
+    with closing(port.socket):
+        stranger.sendto(b"hello", port.local)
+        assert take(port, 100 * LATCH_SILENCE_NS) == b""
+        peer.sendto(b"plain", port.local)
+        assert take(port, 200 * LATCH_SILENCE_NS) == b"plain"
+        assert port.peer == peer.getsockname()
+
+
+def test_without_a_peer_nothing_is_sent_but_counted():
+    port = listen("p", HOME, accept=accept_hello)
+    with closing(port.socket):
+        port.send(b"x")
+        assert port.unsent == 1
+
+
+def test_an_empty_datagram_is_dropped_and_the_next_one_served(peer):
+    port = listen("p", HOME, accept=accept_hello)
+    node = Probe()
+    with closing(UdpDriver(node, [port], Clock())) as driver:
+        for datagram in (b"hello", b"", b"next"):
+            peer.sendto(datagram, port.local)
+        driver.run(until(lambda: len(node.got) >= 2))
+        assert [datagram for _, datagram, _ in node.got] == [b"hello", b"next"]
+
+
+def test_a_busy_port_is_refused_by_its_address(peer):
+    host, number = peer.getsockname()
+    with pytest.raises(InputError, match=rf"address 127\.0\.0\.1:{number}: .*in use"):
+        listen("p", (host, number))
+
+
+def test_an_address_that_is_not_ours_is_refused():
+    with pytest.raises(InputError, match=r"address 192\.0\.2\.1:5"):
+        listen("p", ("192.0.2.1", 5))
+
+
+@pytest.mark.parametrize("open_port", [dial, listen])
+def test_an_address_that_cannot_be_resolved_is_refused(monkeypatch, open_port):
+    def nobody_knows(*_args, **_more):
+        raise socket.gaierror(socket.EAI_NONAME, "Name or service not known")
+
+    monkeypatch.setattr(udp.socket, "getaddrinfo", nobody_knows)
+    with pytest.raises(InputError, match=r"address host\.invalid:14600: cannot be resolved"):
+        open_port("p", ("host.invalid", 14600))
+
+
+@pytest.mark.parametrize("host", ["a" * 70 + ".invalid", "a..b"])
+def test_a_host_name_that_is_none_is_refused(host):
+    with pytest.raises(InputError, match="cannot be resolved"):
+        dial("p", (host, 14600))
+
+
+# the driver
+
+
+def test_a_peer_that_is_not_there_does_not_end_the_driver(peer):
+    node = Probe(deadline_ns=0, beacon=[("p", b"anybody?")])
+    with deaf() as nobody:
+        peer.connect(nobody.getsockname())
+        peer.send(b"anybody?")
+        with pytest.raises(ConnectionRefusedError):
+            peer.recv(99)
+        with closing(UdpDriver(node, [dial("p", nobody.getsockname())], Clock())) as driver:
+            driver.run(passes(50))
+    assert len(node.ticks) == 50
+    assert node.got == []
+
+
+def test_a_peer_that_comes_later_is_served():
+    node = Probe(deadline_ns=0, beacon=[("p", b"anybody?")])
+    with deaf() as late:
+        port = dial("p", late.getsockname())
+        with closing(UdpDriver(node, [port], Clock())) as driver:
+            driver.run(passes(5))
+            late.connect(port.local)
+            driver.run(passes(5))
+            assert late.recv(99) == b"anybody?"
+            late.send(b"here")
+            driver.run(until(lambda: bool(node.got)))
+    assert [datagram for _, datagram, _ in node.got] == [b"here"]
+
+
+class FailingSocket:
+    """A socket whose next reading reports what an ICMP message said about an earlier datagram."""
+
+    def __init__(self, code: int, sock: socket.socket) -> None:
+        self._codes = [code]
+        self._sock = sock
+
+    def __getattr__(self, name):
+        if self._codes and name.startswith("recv"):
+            raise OSError(code := self._codes.pop(), errno.errorcode[code])
+        return getattr(self._sock, name)
+
+
+@pytest.mark.parametrize(
+    "code", [errno.ECONNREFUSED, errno.ECONNRESET, errno.EHOSTUNREACH, errno.ENETUNREACH, errno.EHOSTDOWN]
+)
+def test_no_word_from_the_network_about_a_peer_ends_the_driver(peer, code):
+    port = dial("p", peer.getsockname())
+    with closing(port.socket) as sock:
+        peer.sendto(b"after", port.local)
+        port.socket = FailingSocket(code, sock)
+        select.select([sock], [], [], TIMEOUT_S)
+        assert port.receive(0) == b""
+        assert port.receive(0) == b"after"
+        port.socket = sock
+
+
+def test_a_flood_on_one_port_does_not_keep_the_control_port_waiting(peer, stranger):
+    control, flooded = listen("control", HOME, accept=bool), listen("flooded", HOME, accept=bool)
+    node = Probe(deadline_ns=0)
+    flood = 5 * MAX_PER_PASS
+    for _ in range(flood):
+        stranger.sendto(b"flood", flooded.local)
+
+    def each(_number: int) -> None:
+        peer.sendto(b"control", control.local)
+
+    with closing(UdpDriver(node, [control, flooded], Clock())) as driver:
+        driver.run(passes(4, each))
+    order = [port for port, _, _ in node.got]
+    assert order == (["control"] + ["flooded"] * MAX_PER_PASS) * 4
+    assert len(node.ticks) == 4
+
+
+def test_answers_leave_and_the_driver_stops_when_told(peer):
+    port = listen("p", HOME, accept=bool)
+    node = Probe(echo=True)
+    with closing(UdpDriver(node, [port], Clock())) as driver:
+        peer.sendto(b"ping", port.local)
+        driver.run(until(lambda: bool(node.got)))
+        assert peer.recv(99) == b"ping"
+
+
+def test_the_node_lives_on_its_own_clock_from_the_boot_of_its_driver(peer, monkeypatch):
+    now = 50 * NS_PER_S
+    monkeypatch.setattr(udp, "true_ns", lambda: now)
+    node = Probe(deadline_ns=0)
+    port = listen("p", HOME, accept=bool)
+    with closing(UdpDriver(node, [port], Clock(137 * NS_PER_S, 100_000))) as driver:
+        now += 10 * NS_PER_S
+        peer.sendto(b"x", port.local)
+        select.select([port.socket], [], [], TIMEOUT_S)
+        driver.run(passes(1))
+    assert node.ticks == [147 * NS_PER_S + 1_000_000]
+    assert node.got == [("p", b"x", 147 * NS_PER_S + 1_000_000)]
+
+
+def test_a_tick_is_never_early(peer):
+    node = Probe(deadline_ns=20_000_000)
+    with closing(UdpDriver(node, [dial("p", peer.getsockname())], Clock())) as driver:
+        driver.run(until(lambda: bool(node.ticks)))
+        assert driver.clock.node_ns(true_ns()) >= node.ticks[0] >= node.deadline_ns
+
+
+@dataclass
+class Sink:
+    records: list[tuple[Record, int]] = field(default_factory=list)
+    pumped: int = 0
+
+    def write(self, record, log_time_ns):
+        self.records.append((record, log_time_ns))
+
+    def pump(self):
+        self.pumped += 1
+
+
+@pytest.mark.parametrize("tap", [False, True])
+def test_records_are_filed_at_true_time_and_datagrams_with_the_tap_only(peer, tap):
+    before = true_ns()
+    sink, node = Sink(), Probe(deadline_ns=0, echo=True)
+    port = listen("p", HOME, accept=bool)
+    with closing(UdpDriver(node, [port], Clock(9 * NS_PER_S), sink, tap=tap)) as driver:
+        peer.sendto(b"ping", port.local)
+        driver.run(passes(2))
+    by_time = sorted(sink.records, key=lambda record: record[1])
+    frames = [r.body["direction"] for r, _ in by_time if r.topic == "mavlink/p"]
+    assert frames == (["received", "sent"] if tap else [])
+    assert sum(r.topic == "events" for r, _ in sink.records) == len(node.ticks) == sink.pumped == 2
+    assert all(before <= at_ns <= true_ns() for _, at_ns in sink.records)

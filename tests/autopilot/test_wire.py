@@ -1,0 +1,337 @@
+"""Frames: both ways against pymavlink's own parser, and everything that is no frame."""
+
+from __future__ import annotations
+
+import math
+import struct
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from pymavlink.dialects.v20 import ardupilotmega as dialect
+
+from autopilot.link import wire as wire_module
+from autopilot.link.wire import (
+    AUTOPILOT,
+    PLANT,
+    AoaSsa,
+    Attitude,
+    Heartbeat,
+    HilActuatorControls,
+    NamedValueInt,
+    Reject,
+    ServoOutputRaw,
+    Severity,
+    StatusText,
+    Timesync,
+    VfrHud,
+    Wire,
+    autopilot_heartbeat,
+    frames_of,
+    plant_heartbeat,
+    split_frames,
+)
+from tests.helpers import broken, parse
+
+quick = settings(deadline=None)
+f32 = st.floats(width=32, allow_nan=False, allow_infinity=False)
+u8, u16, u32, u64 = (st.integers(0, (1 << n) - 1) for n in (8, 16, 32, 64))
+i16, i32, i64 = (st.integers(-(1 << n), (1 << n) - 1) for n in (15, 31, 63))
+ascii_text = st.text(st.characters(min_codepoint=32, max_codepoint=126), max_size=50)
+names = st.text(st.characters(min_codepoint=48, max_codepoint=90), min_size=1, max_size=10)
+messages = st.one_of(
+    st.builds(Heartbeat, u8, u8, u8, u32, u8),
+    st.builds(Attitude, u32, f32, f32, f32, f32, f32, f32),
+    st.builds(AoaSsa, u64, f32, f32),
+    st.builds(VfrHud, f32, f32, i16, u16, f32, f32),
+    st.builds(ServoOutputRaw, u32, u16),
+    st.builds(HilActuatorControls, u64, f32),
+    st.builds(NamedValueInt, u32, names, i32),
+    st.builds(Timesync, i64, i64),
+    st.builds(StatusText, u8, ascii_text),
+)
+NAN, INF = math.nan, math.inf
+GOOD = AoaSsa(123_456, 1.5, -0.5)
+EXAMPLES = [
+    Heartbeat(1, 8, 0, 0, 4),
+    Attitude(1000, 0.125, -0.25, 0.375, -0.5, 0.625, -0.75),
+    GOOD,
+    VfrHud(100.0, 101.0, 359, 50, 1600.0, -1.5),
+    ServoOutputRaw(4_000_000_000, 1500),
+    HilActuatorControls(1 << 40, -0.25),
+    NamedValueInt(77, "DELAY_K", 3),
+    Timesync(0, 1_042_000_000_000),
+    StatusText(6, "hello"),
+]
+
+
+def pair() -> tuple[Wire, Wire]:
+    """Return the plant's and the autopilot's end."""
+    return Wire(PLANT, AUTOPILOT), Wire(AUTOPILOT, PLANT)
+
+
+def native(source: tuple[int, int] = PLANT) -> dialect.MAVLink:
+    return dialect.MAVLink(None, srcSystem=source[0], srcComponent=source[1])
+
+
+def as_pymavlink(message) -> dict[str, object]:
+    """Return what pymavlink shall read in a message of ours."""
+    match message:
+        case ServoOutputRaw():
+            return {"time_usec": message.time_usec, "servo2_raw": message.servo2_raw, "servo1_raw": 0}
+        case HilActuatorControls():
+            return {"time_usec": message.time_usec, "controls": [0.0, message.elevator] + [0.0] * 14}
+    return {f.name: getattr(message, f.name) for f in fields(message)}
+
+
+@quick
+@given(st.lists(messages, min_size=1, max_size=10))
+def test_a_plain_mavlink_parser_reads_our_frames_with_equal_fields(sent):
+    plant, _ = pair()
+    parsed = parse(b"".join(plant.encode(m) for m in sent))
+    assert len(parsed) == len(sent)
+    for ours, theirs in zip(sent, parsed, strict=True):
+        assert (theirs.get_srcSystem(), theirs.get_srcComponent()) == PLANT
+        for name, value in as_pymavlink(ours).items():
+            assert getattr(theirs, name) == value, (type(ours), name)
+
+
+@quick
+@given(st.lists(messages, min_size=1, max_size=20))
+def test_frames_of_one_end_are_the_same_messages_at_the_other(sent):
+    plant, autopilot = pair()
+    assert [m for ours in sent for m in autopilot.decode(plant.encode(ours))] == sent
+    assert autopilot.received == plant.sent == len(sent)
+    assert not autopilot.rejects
+
+
+def test_sequence_numbers_are_consecutive_and_wrap_after_255():
+    plant, _ = pair()
+    parsed = parse(b"".join(plant.encode(GOOD) for _ in range(600)))
+    assert [m.get_seq() for m in parsed] == [n % 256 for n in range(600)]
+
+
+def test_frames_are_mavlink_2():
+    plant, _ = pair()
+    assert all(plant.encode(m)[0] == 0xFD for m in EXAMPLES)
+
+
+def test_frames_packed_by_pymavlink_are_read_by_field():
+    theirs = [
+        dialect.MAVLink_heartbeat_message(1, 3, 81, 7, 4, 3),
+        dialect.MAVLink_attitude_message(42, 0.5, 0.25, -1.0, 2.0, -0.125, 0.75),
+        dialect.MAVLink_aoa_ssa_message(1 << 41, 3.5, -1.25),
+        dialect.MAVLink_vfr_hud_message(100.5, 99.5, -1, 42, 1600.0, 2.5),
+        dialect.MAVLink_servo_output_raw_message(0xFFFFFFFF, 1, 1100, 1200, 1300, 1400, 1500, 1600, 1700, 1800),
+        dialect.MAVLink_hil_actuator_controls_message(9, [n / 16 for n in range(16)], 129, 0),
+        dialect.MAVLink_named_value_int_message(5, b"SAMPLE_K", -7),
+        dialect.MAVLink_timesync_message(-3, 1 << 60),
+        dialect.MAVLink_statustext_message(4, b"fifty".ljust(50, b"!")),
+    ]
+    mavlink, (_, autopilot) = native(), pair()
+    assert autopilot.decode(b"".join(m.pack(mavlink) for m in theirs)) == [
+        Heartbeat(1, 3, 81, 7, 4),
+        Attitude(42, 0.5, 0.25, -1.0, 2.0, -0.125, 0.75),
+        AoaSsa(1 << 41, 3.5, -1.25),
+        VfrHud(100.5, 99.5, -1, 42, 1600.0, 2.5),
+        ServoOutputRaw(0xFFFFFFFF, 1200),
+        HilActuatorControls(9, 1 / 16),
+        NamedValueInt(5, "SAMPLE_K", -7),
+        Timesync(-3, 1 << 60),
+        StatusText(4, "fifty".ljust(50, "!")),
+    ]
+
+
+def test_mavlink_1_frames_of_the_peer_are_read_too():
+    _, autopilot = pair()
+    frame = dialect.MAVLink_attitude_message(42, 0.5, 0.25, -1.0, 2.0, -0.125, 0.75).pack(native(), force_mavlink1=True)
+    assert frame[0] == 0xFE
+    assert autopilot.decode(bytes(frame)) == [Attitude(42, 0.5, 0.25, -1.0, 2.0, -0.125, 0.75)]
+
+
+def test_times_wrap_on_the_wire_as_u32():
+    plant, autopilot = pair()
+    for message, name in (
+        (EXAMPLES[1], "time_boot_ms"),
+        (EXAMPLES[4], "time_usec"),
+        (EXAMPLES[6], "time_boot_ms"),
+    ):
+        [back] = autopilot.decode(plant.encode(replace(message, **{name: (1 << 32) + 9})))
+        assert getattr(back, name) == 9
+
+
+def test_text_is_cut_at_50_characters_and_made_ascii():
+    plant, autopilot = pair()
+    assert autopilot.decode(plant.encode(StatusText(4, "α" + "x" * 60))) == [StatusText(4, "?" + "x" * 49)]
+
+
+@quick
+@given(st.binary(max_size=2500), messages)
+def test_no_datagram_touches_the_next_one(noise, message):
+    plant, autopilot = pair()
+    autopilot.decode(noise)
+    assert autopilot.decode(plant.encode(message)) == [message]
+
+
+@quick
+@given(messages, st.data())
+def test_a_cut_frame_is_counted_and_does_not_touch_the_next_one(message, data):
+    plant, autopilot = pair()
+    frame = plant.encode(message)
+    assert autopilot.decode(frame[: data.draw(st.integers(1, len(frame) - 1))]) == []
+    assert autopilot.rejects == {Reject.TRUNCATED: 1}
+    assert autopilot.decode(frame) == [message]
+
+
+@pytest.mark.parametrize("bad", [NAN, INF, -INF])
+@pytest.mark.parametrize(
+    ("message", "name"),
+    [(m, n) for m in EXAMPLES for n in wire_module._CODECS[type(m)].floats],
+    ids=lambda v: v if isinstance(v, str) else type(v).__name__,
+)
+def test_what_is_not_finite_is_dropped_and_counted(message, name, bad):
+    plant, autopilot = pair()
+    frame = plant.encode(replace(message, **{name: bad}))
+    assert autopilot.decode(frame) == []
+    assert autopilot.rejects == {Reject.NON_FINITE: 1}
+
+
+def test_every_float_of_every_message_is_checked_for_being_finite():
+    for message in EXAMPLES:
+        floats = {f.name for f in fields(message) if isinstance(getattr(message, f.name), float)}
+        assert set(wire_module._CODECS[type(message)].floats) == floats
+
+
+@pytest.mark.parametrize("source", [(2, 25), (1, 24), (1, 1), (255, 190), (0, 0)])
+def test_frames_of_others_are_dropped_and_counted(source):
+    _, autopilot = pair()
+    assert autopilot.decode(Wire(source, None).encode(GOOD)) == []
+    assert autopilot.rejects == {Reject.WRONG_SOURCE: 1}
+
+
+def test_a_wire_without_peer_takes_everybody_but_itself():
+    wire = Wire(AUTOPILOT, None)
+    assert wire.decode(Wire((255, 190), None).encode(GOOD)) == [GOOD]
+    assert wire.decode(Wire(AUTOPILOT, None).encode(GOOD)) == []
+    assert wire.rejects == {Reject.WRONG_SOURCE: 1}
+
+
+def test_an_unknown_id_is_counted():
+    _, autopilot = pair()
+    unknown = next(n for n in range(60_000, 70_000) if n not in dialect.mavlink_map)
+    frame = bytearray(Wire(PLANT, None).encode(GOOD))
+    frame[7:10] = unknown.to_bytes(3, "little")
+    assert autopilot.decode(bytes(frame)) == []
+    assert autopilot.rejects == {Reject.UNKNOWN_ID: 1}
+
+
+def test_a_known_id_that_nobody_here_serves_is_counted():
+    _, autopilot = pair()
+    assert autopilot.decode(dialect.MAVLink_ping_message(1, 2, 3, 4).pack(native())) == []
+    assert autopilot.rejects == {Reject.UNHANDLED: 1}
+
+
+@pytest.mark.parametrize("message", EXAMPLES, ids=lambda m: type(m).__name__)
+def test_every_flipped_bit_of_payload_and_checksum_is_found(message):
+    plant, autopilot = pair()
+    frame = plant.encode(message)
+    for position in range(8 * 10, 8 * len(frame)):
+        flipped = bytearray(frame)
+        flipped[position // 8] ^= 1 << (position % 8)
+        assert autopilot.decode(bytes(flipped)) == []
+    assert autopilot.rejects == {Reject.BAD_CRC: 8 * (len(frame) - 10)}
+
+
+def test_an_unknown_incompatibility_flag_makes_a_frame_malformed():
+    plant, autopilot = pair()
+    frame = bytearray(plant.encode(GOOD))
+    frame[2] = 0x02
+    assert autopilot.decode(bytes(frame)) == []
+    assert autopilot.rejects == {Reject.MALFORMED: 1}
+
+
+def test_an_oversized_datagram_is_not_looked_at():
+    plant, autopilot = pair()
+    frame = plant.encode(GOOD)
+    assert autopilot.decode(frame * (2048 // len(frame) + 1)) == []
+    assert autopilot.rejects == {Reject.OVERSIZE: 1}
+
+
+def test_an_empty_datagram_is_nothing():
+    _, autopilot = pair()
+    assert autopilot.decode(b"") == []
+    assert not autopilot.rejects
+
+
+def test_one_bad_frame_among_several_costs_only_itself():
+    plant, autopilot = pair()
+    first, second, third = (plant.encode(m) for m in EXAMPLES[1:4])
+    damaged = second[:12] + bytes([second[12] ^ 1]) + second[13:]
+    assert autopilot.decode(first + damaged + third) == [EXAMPLES[1], EXAMPLES[3]]
+    assert autopilot.rejects == {Reject.BAD_CRC: 1}
+
+
+def test_noise_after_good_frames_costs_only_the_rest():
+    plant, autopilot = pair()
+    assert autopilot.decode(plant.encode(GOOD) + b"noise") == [GOOD]
+    assert autopilot.rejects == {Reject.NO_FRAME: 1}
+
+
+def test_20000_broken_frames_raise_nothing_and_are_all_counted():
+    rng = np.random.default_rng(1)
+    plant, autopilot = pair()
+    datagrams = [broken(plant.encode(EXAMPLES[n % len(EXAMPLES)]), rng) for n in range(20_000)]
+    assert [m for d in datagrams for m in autopilot.decode(d)] == []
+    assert sum(autopilot.rejects.values()) >= sum(1 for d in datagrams if d)
+    assert autopilot.decode(plant.encode(GOOD)) == [GOOD]
+
+
+@quick
+@given(st.lists(messages, max_size=8), st.binary(max_size=40))
+def test_frames_and_rest_make_up_the_datagram(sent, rest):
+    plant, _ = pair()
+    packed = [plant.encode(m) for m in sent]
+    frames, leftover = split_frames(b"".join(packed) + rest)
+    assert frames[: len(packed)] == packed
+    assert (b"".join(packed) + rest).startswith(b"".join(frames))
+    assert (leftover is None) == (len(b"".join(frames)) == len(b"".join(packed) + rest))
+
+
+@quick
+@given(st.integers(1, 255), st.integers(0, 255))
+def test_nan_payloads_of_any_bit_pattern_are_found(quiet, sign):
+    plant, autopilot = pair()
+    pattern = struct.unpack("<f", bytes([quiet, 0, 0x80, 0x7F | (sign & 0x80)]))[0]
+    assert autopilot.decode(plant.encode(AoaSsa(1, pattern, 0.0))) == []
+    assert autopilot.rejects == {Reject.NON_FINITE: 1}
+
+
+def test_a_listener_latches_on_a_valid_frame_of_the_expected_source_only():
+    accept = frames_of(PLANT)
+    frame = Wire(PLANT, None).encode(GOOD)
+    assert accept(frame)
+    assert not accept(Wire(AUTOPILOT, None).encode(GOOD))
+    assert not accept(frame[:-1] + bytes([frame[-1] ^ 1]))
+    assert not accept(b"hello")
+    assert not accept(b"")
+
+
+def test_no_ground_station_takes_the_plant_for_a_vehicle():
+    [seen] = parse(Wire(PLANT, None).encode(plant_heartbeat()))
+    assert (seen.type, seen.autopilot) == (dialect.MAV_TYPE_FIXED_WING, dialect.MAV_AUTOPILOT_INVALID)
+
+
+@pytest.mark.parametrize("tracking", [False, True])
+@pytest.mark.parametrize("degraded", [False, True])
+def test_the_autopilot_is_a_fixed_wing_vehicle_whose_heartbeat_tells_its_state(tracking, degraded):
+    [seen] = parse(Wire(AUTOPILOT, None).encode(autopilot_heartbeat(tracking=tracking, degraded=degraded)))
+    assert seen.type == dialect.MAV_TYPE_FIXED_WING
+    assert seen.autopilot != dialect.MAV_AUTOPILOT_INVALID
+    assert bool(seen.base_mode & dialect.MAV_MODE_FLAG_STABILIZE_ENABLED) is tracking
+    assert (seen.system_status == dialect.MAV_STATE_CRITICAL) is degraded
+
+
+def test_severities_are_mavlinks():
+    assert (Severity.ERROR, Severity.WARNING, Severity.NOTICE, Severity.INFO) == (3, 4, 5, 6)

@@ -1,0 +1,109 @@
+"""Turnaround of the autopilot over UDP, ATTITUDE and AOA_SSA in, SERVO_OUTPUT_RAW out, against a bare echo.
+
+Both run as processes of their own on loopback and are asked in turn, at the pace of the samples, by the same
+loop: the ratio is that of the two medians.
+"""
+
+from __future__ import annotations
+
+import socket
+import statistics
+import subprocess
+import sys
+import time
+
+from pymavlink.dialects.v20 import ardupilotmega as dialect
+
+SAMPLES = 400
+WARM_UP = 40
+PERIOD_S = 0.025
+LIMIT = 4.0
+
+ECHO = """
+import socket
+s = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+s.bind(("127.0.0.1", 0))
+print(s.getsockname()[1], flush=True)
+while True:
+    data, peer = s.recvfrom(2048)
+    s.sendto(data, peer)
+"""
+
+
+class FakePlant:
+    """Answers TIMESYNC and counts the replies to samples, over one socket, as system 1, component 25."""
+
+    def __init__(self) -> None:
+        self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self.socket.bind(("127.0.0.1", 0))
+        self.mav = dialect.MAVLink(None, 1, 25)
+        self.peer: tuple[str, int] | None = None
+
+    def send(self, message: dialect.MAVLink_message) -> None:
+        assert self.peer is not None
+        self.socket.sendto(message.pack(self.mav), self.peer)
+        self.mav.seq = (self.mav.seq + 1) % 256
+
+    def serve(self, until: float, wanted: str | None = None) -> float | None:
+        """Answer until a time, or until a message of the wanted type; return when it came."""
+        while (left := until - time.perf_counter()) > 0:
+            self.socket.settimeout(left)
+            try:
+                data, self.peer = self.socket.recvfrom(2048)
+            except TimeoutError:
+                return None
+            at = time.perf_counter()
+            message = self.mav.decode(bytearray(data))
+            if message.get_type() == wanted:
+                return at
+            if message.get_type() == "TIMESYNC" and message.tc1 == 0:
+                self.send(dialect.MAVLink_timesync_message(time.perf_counter_ns(), message.ts1))
+        return None
+
+
+def measure() -> list[tuple[str, float, float, str]]:
+    """Return the ratio of the median turnarounds."""
+    plant = FakePlant()
+    echo_client = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    echo = subprocess.Popen([sys.executable, "-c", ECHO], stdout=subprocess.PIPE, text=True)
+    address = f"udpout:127.0.0.1:{plant.socket.getsockname()[1]}"
+    autopilot = subprocess.Popen(
+        [sys.executable, "-m", "autopilot", "--plant", address, "--gcs", "udpout:127.0.0.1:9"],
+        stderr=subprocess.DEVNULL,
+    )
+    try:
+        assert echo.stdout is not None
+        echo_client.connect(("127.0.0.1", int(echo.stdout.readline())))
+        echo_client.settimeout(2.0)
+        assert plant.serve(time.perf_counter() + 30.0, "HEARTBEAT") is not None, "the autopilot did not start"
+        ours, theirs = _ask_in_turn(plant, echo_client)
+    finally:
+        for process in (echo, autopilot):
+            process.kill()
+            process.wait()
+    ratio = statistics.median(ours) / statistics.median(theirs)
+    note = f"median {statistics.median(ours) * 1e6:.0f} us, echo {statistics.median(theirs) * 1e6:.0f} us"
+    return [("autopilot turnaround / bare UDP echo", ratio, LIMIT, note)]
+
+
+def _ask_in_turn(plant: FakePlant, echo_client: socket.socket) -> tuple[list[float], list[float]]:
+    ours, theirs = [], []
+    start = time.perf_counter()
+    plant.send(dialect.MAVLink_named_value_int_message(int(start * 1000) & 0xFFFFFFFF, b"SAMPLE_K", 0))
+    for k in range(SAMPLES + WARM_UP):
+        plant.serve(start + k * PERIOD_S)
+        stamp_us = time.perf_counter_ns() // 1000
+        attitude = dialect.MAVLink_attitude_message(stamp_us // 1000 & 0xFFFFFFFF, 0.0, 0.01, 0.0, 0.0, 0.001, 0.0)
+        sent = time.perf_counter()
+        plant.send(attitude)
+        plant.send(dialect.MAVLink_aoa_ssa_message(stamp_us, 0.5, 0.0))
+        came = plant.serve(sent + 0.02, "SERVO_OUTPUT_RAW")
+        if came is not None and k >= WARM_UP:
+            ours.append(came - sent)
+        plant.serve(start + (k + 0.5) * PERIOD_S)
+        sent = time.perf_counter()
+        echo_client.send(b"x" * 40)
+        echo_client.recv(2048)
+        theirs.append(time.perf_counter() - sent)
+    assert len(ours) > 0.9 * SAMPLES, f"only {len(ours)} of {SAMPLES} samples were answered"
+    return ours, theirs
