@@ -39,10 +39,14 @@ class FakePlant:
         self.mav = dialect.MAVLink(None, 1, 25)
         self.peer: tuple[str, int] | None = None
 
-    def send(self, message: dialect.MAVLink_message) -> None:
-        assert self.peer is not None
-        self.socket.sendto(message.pack(self.mav), self.peer)
+    def pack(self, message: dialect.MAVLink_message) -> bytes:
+        frame: bytes = message.pack(self.mav)
         self.mav.seq = (self.mav.seq + 1) % 256
+        return frame
+
+    def send(self, frame: bytes) -> None:
+        assert self.peer is not None
+        self.socket.sendto(frame, self.peer)
 
     def serve(self, until: float, wanted: str | None = None) -> float | None:
         """Answer until a time, or until a message of the wanted type; return when it came."""
@@ -57,7 +61,7 @@ class FakePlant:
             if message.get_type() == wanted:
                 return at
             if message.get_type() == "TIMESYNC" and message.tc1 == 0:
-                self.send(dialect.MAVLink_timesync_message(time.perf_counter_ns(), message.ts1))
+                self.send(self.pack(dialect.MAVLink_timesync_message(time.perf_counter_ns(), message.ts1)))
         return None
 
 
@@ -89,14 +93,16 @@ def measure() -> list[tuple[str, float, float, str]]:
 def _ask_in_turn(plant: FakePlant, echo_client: socket.socket) -> tuple[list[float], list[float]]:
     ours, theirs = [], []
     start = time.perf_counter()
-    plant.send(dialect.MAVLink_named_value_int_message(int(start * 1000) & 0xFFFFFFFF, b"SAMPLE_K", 0))
+    plant.send(plant.pack(dialect.MAVLink_named_value_int_message(int(start * 1000) & 0xFFFFFFFF, b"SAMPLE_K", 0)))
     for k in range(SAMPLES + WARM_UP):
         plant.serve(start + k * PERIOD_S)
         stamp_us = time.perf_counter_ns() // 1000
-        attitude = dialect.MAVLink_attitude_message(stamp_us // 1000 & 0xFFFFFFFF, 0.0, 0.01, 0.0, 0.0, 0.001, 0.0)
+        stamp_ms = stamp_us // 1000 & 0xFFFFFFFF
+        attitude = plant.pack(dialect.MAVLink_attitude_message(stamp_ms, 0.0, 0.01, 0.0, 0.0, 0.001, 0.0))
+        air = plant.pack(dialect.MAVLink_aoa_ssa_message(stamp_us, 0.5, 0.0))
         sent = time.perf_counter()
         plant.send(attitude)
-        plant.send(dialect.MAVLink_aoa_ssa_message(stamp_us, 0.5, 0.0))
+        plant.send(air)
         came = plant.serve(sent + 0.02, "SERVO_OUTPUT_RAW")
         if came is not None and k >= WARM_UP:
             ours.append(came - sent)

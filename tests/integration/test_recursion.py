@@ -1,6 +1,6 @@
 """The flight through MAVLink against a direct recursion of Eqs. (4) and (9).
 
-The recursion below knows nothing of nodes, links, frames or clocks. It takes only d(k), xr(j) and w(k) from
+The recursion knows nothing of nodes, links, frames or clocks. It takes only d(k), xr(j) and w(k) from
 the recording and computes the flight again with NumPy.
 """
 
@@ -11,49 +11,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from gains.model import Gains
+from autopilot.link.clock import Clock
 from sitl.flight import fly_virtual
 from sitl.impairment import parse_link
 from sitl.recorder import FlightRecorder
 from sitl.scenario import Scenario, load_scenario
-
-
-def recursion(gains: Gains, truth: list[dict], commands: dict[int, dict], x0: np.ndarray) -> np.ndarray:
-    """Return x(k) of Eqs. (4) and (9), with the elevator's travel, for every recorded sample."""
-    m = gains.model
-    xs = [np.array(x0, dtype=float)]
-    for k, body in enumerate(truth):
-        u = np.zeros(m.nu)
-        if body["d"] is not None:
-            j = k - body["d"]
-            u = gains.K1 @ xs[j]
-            if gains.K2 is not None:
-                u = u + gains.K2 @ np.array(commands[j]["xr"])
-            u = np.clip(u, m.actuator.low, m.actuator.high)
-        xs.append(m.A @ xs[k] + m.B @ u + m.E @ np.array(body["w"]))
-    return np.array(xs[:-1])
-
-
-def tables(recorder: FlightRecorder) -> tuple[list[dict], dict[int, dict]]:
-    truth = [body for topic, _, body in recorder.kept if topic == "plant/truth"]
-    commands = {body["j"]: body for topic, _, body in recorder.kept if topic == "autopilot/command"}
-    return truth, commands
+from tests.integration.recursion import deviation, tables
 
 
 def fly(scenario: Scenario) -> tuple[list[dict], dict[int, dict]]:
     recorder = FlightRecorder(None, {})
     fly_virtual(scenario, recorder.write)
-    return tables(recorder)
-
-
-def deviation(scenario: Scenario, truth: list[dict], commands: dict[int, dict]) -> float:
-    """Return max |C (x - x')|, the output's difference in rad."""
-    m = scenario.gains.model
-    x0 = m.trim.x if scenario.x0 is None else scenario.x0
-    flown = np.array([body["x"] for body in truth])
-    computed = recursion(scenario.gains, truth, commands, x0)
-    assert [body["k"] for body in truth] == list(range(len(truth)))
-    return float(np.abs((flown - computed) @ m.C.T).max())
+    return tables(recorder.kept)
 
 
 @pytest.mark.parametrize("name", ["nominal", "gust", "pendulum"])
@@ -100,3 +69,13 @@ def test_with_a_constant_delay_the_reference_state_of_a_command_is_that_of_equat
         xr = reference.Ar @ xr + reference.Br @ np.array(r)
     assert checked > 390
     assert np.abs(xr).max() > 0.05
+
+
+@pytest.mark.parametrize("wraps_at_s", [4294.967296, 4294967.296], ids=["u32 us", "u32 ms"])
+def test_a_flight_across_a_wrap_of_the_plants_stamps_is_the_recursion(wraps_at_s: float) -> None:
+    scenario = replace(load_scenario("nominal"), actuator="float")
+    clocks = {**scenario.clocks, "plant": Clock(round((wraps_at_s - 5.0) * 1e9), 40_000)}
+    truth, commands = fly(replace(scenario, clocks=clocks))
+    assert truth[0]["t_ns"] < wraps_at_s * 1e9 < truth[-1]["t_ns"]
+    assert max(body["d"] for body in truth if body["d"] is not None) <= 3
+    assert deviation(scenario, truth, commands) < 1e-5
