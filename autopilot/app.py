@@ -15,7 +15,7 @@ from autopilot.clocksync import ClockSync
 from autopilot.control import law_of
 from autopilot.delay import UNKNOWN, DelayEstimate, DelayEstimator
 from autopilot.failsafe import Event, FailsafeState, Limits, Mode, step
-from autopilot.link.clock import NS_PER_MS, NS_PER_S, NS_PER_US
+from autopilot.link.clock import NS_PER_MS, NS_PER_S, NS_PER_US, following
 from autopilot.link.node import Datagram, Record
 from autopilot.link.wire import (
     AUTOPILOT,
@@ -47,6 +47,8 @@ TIMESYNC_NS = 100 * NS_PER_MS
 SYNC_WAIT_NS = 2 * NS_PER_S
 """A plant that answers no TIMESYNC gets its heartbeat after this time all the same."""
 COUNTERS_NS = NS_PER_S
+MAX_AHEAD = 200
+"""Samples that the reference is looked ahead at the most, whatever delay a peer makes us believe in."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -164,7 +166,7 @@ class AutopilotNode:
         self.vehicle.tick(now_ns, tracking=mode is Mode.TRACKING, degraded=mode in (Mode.HOLD, Mode.NEUTRAL))
         assert self._next_counters_ns is not None
         if now_ns >= self._next_counters_ns:
-            self._next_counters_ns += COUNTERS_NS
+            self._next_counters_ns = following(self._next_counters_ns, COUNTERS_NS, now_ns)
             self._record_counters(now_ns)
 
     def next_deadline_ns(self) -> int | None:
@@ -263,7 +265,7 @@ class AutopilotNode:
             self.reference.advance(sample.j)
             if self.failsafe.mode is Mode.TRACKING and was in (Mode.HOLD, Mode.NEUTRAL):
                 self._match_reference(sample)
-        ahead = forecast.d if forecast.d is not None else gains.d_min
+        ahead = min(forecast.d, MAX_AHEAD) if forecast.d is not None else gains.d_min
         xr = self.reference.ahead(ahead) if self.reference is not None else ()
         saturated = False
         if self.failsafe.mode is Mode.TRACKING or self.config.failsafe == "monitor":
@@ -316,7 +318,7 @@ class AutopilotNode:
             self._next_timesync_ns = now_ns + (TIMESYNC_START_NS if starting else TIMESYNC_NS)
             self._send(Timesync(0, self.clock.request(now_ns)))
         if self._next_heartbeat_ns is not None and now_ns >= self._next_heartbeat_ns:
-            self._next_heartbeat_ns += HEARTBEAT_NS
+            self._next_heartbeat_ns = following(self._next_heartbeat_ns, HEARTBEAT_NS, now_ns)
             tracking = self.failsafe.mode is Mode.TRACKING
             self._send(autopilot_heartbeat(tracking=tracking, degraded=False))
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 
-from autopilot.link.clock import NS_PER_MS, NS_PER_S, NS_PER_US
+from autopilot.link.clock import NS_PER_MS, NS_PER_S, NS_PER_US, following
 from autopilot.link.node import Datagram
 from autopilot.link.wire import (
     AUTOPILOT,
@@ -81,7 +81,7 @@ class Vehicle:
         for message in waiting:
             self._send(message)
         if now_ns >= self._next_heartbeat_ns:
-            self._next_heartbeat_ns += HEARTBEAT_NS
+            self._next_heartbeat_ns = following(self._next_heartbeat_ns, HEARTBEAT_NS, now_ns)
             self._send(autopilot_heartbeat(tracking=tracking, degraded=degraded))
 
     def next_deadline_ns(self) -> int | None:

@@ -17,7 +17,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from autopilot.link.clock import NS_PER_MS, NS_PER_S, NS_PER_US, unwrap
+from autopilot.link.clock import NS_PER_MS, NS_PER_S, NS_PER_US, following, unwrap
 from autopilot.link.node import Datagram, Record
 from autopilot.link.sensors import sensors_of
 from autopilot.link.servo import travel_of
@@ -182,7 +182,7 @@ class PlantNode:
     def tick(self, now_ns: int) -> None:
         """Work off the samples that are due."""
         if self._next_heartbeat_ns is not None and now_ns >= self._next_heartbeat_ns:
-            self._next_heartbeat_ns += NS_PER_S
+            self._next_heartbeat_ns = following(self._next_heartbeat_ns, NS_PER_S, now_ns)
             self._send(plant_heartbeat())
         flight = self._flight
         if flight is None:

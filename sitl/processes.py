@@ -34,6 +34,8 @@ READ_BYTES = 1 << 18
 HELLO_TIMEOUT_S = 30.0
 STOP_TIMEOUT_S = 5.0
 MAX_LAST_WORDS = 2000
+MAX_UNKNOWN = 16
+"""Connections that have not said hello; the oldest is dropped for a further one."""
 
 if sys.platform == "win32":
     _OWN_GROUP: dict[str, Any] = {"creationflags": subprocess.CREATE_NEW_PROCESS_GROUP}
@@ -75,7 +77,7 @@ class _Child:
     ended: bool = False
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, eq=False)
 class _Connection:
     """One stream: unauthenticated until its hello."""
 
@@ -101,6 +103,7 @@ class Supervisor:
         self._write = write
         self._token = secrets.token_hex(16)
         self._children: dict[str, _Child] = {}
+        self._unknown: list[_Connection] = []
         self._selector = selectors.DefaultSelector()
         self._listener = socket.create_server(("127.0.0.1", 0))
         self._listener.setblocking(False)
@@ -194,9 +197,13 @@ class Supervisor:
 
     def _accept(self) -> None:
         with contextlib.suppress(BlockingIOError):
-            connection, _ = self._listener.accept()
-            connection.setblocking(False)
-            self._selector.register(connection, selectors.EVENT_READ, _Connection(connection))
+            accepted, _ = self._listener.accept()
+            accepted.setblocking(False)
+            connection = _Connection(accepted)
+            self._selector.register(accepted, selectors.EVENT_READ, connection)
+            self._unknown.append(connection)
+            if len(self._unknown) > MAX_UNKNOWN:
+                self._drop(self._unknown[0])
 
     def _read(self, connection: _Connection) -> None:
         """Take the lines that have come; drop a stream that ends or breaks the rules."""
@@ -234,9 +241,12 @@ class Supervisor:
         if not known or child.connection is not None:
             return False
         child.connection, child.ports, connection.child = connection.socket, ports, child
+        self._unknown.remove(connection)
         return True
 
     def _drop(self, connection: _Connection) -> None:
+        if connection in self._unknown:
+            self._unknown.remove(connection)
         self._selector.unregister(connection.socket)
         connection.socket.close()
         if connection.child is not None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-__all__ = ["NS_PER_MS", "NS_PER_S", "NS_PER_US", "Clock", "unwrap"]
+__all__ = ["NS_PER_MS", "NS_PER_S", "NS_PER_US", "Clock", "following", "unwrap"]
 
 NS_PER_US = 1_000
 NS_PER_MS = 1_000_000
@@ -48,6 +48,11 @@ class Clock:
         while self.node_ns(guess_ns - 1) >= node_ns:
             guess_ns -= 1
         return guess_ns
+
+
+def following(due_ns: int, period_ns: int, now_ns: int) -> int:
+    """Return when something periodic that was due is due again: on its grid, but never twice to catch up."""
+    return due_ns + max(1, -(-(now_ns + 1 - due_ns) // period_ns)) * period_ns
 
 
 def unwrap(value: int, near: int, modulus: int) -> int:

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from autopilot.link.clock import NS_PER_S, Clock, unwrap
+from autopilot.link.clock import NS_PER_S, Clock, following, unwrap
 
 DAY_NS = 86_400 * NS_PER_S
 quick = settings(deadline=None)
@@ -87,3 +87,11 @@ def test_unwrap_restores_a_counter_from_any_reading_within_half_its_range(near, 
 )
 def test_unwrap_crosses_the_wrap_both_ways(value, near, expected):
     assert unwrap(value, near, 1 << 32) == expected
+
+
+@quick
+@given(due=times, period=st.integers(1, 10**10), late=st.integers(0, 10**12))
+def test_what_is_due_again_stays_on_its_grid_and_lies_in_the_next_period(due, period, late):
+    again = following(due, period, due + late)
+    assert (again - due) % period == 0
+    assert due + late < again <= due + late + period
