@@ -21,7 +21,7 @@ from gains.store import load_model
 from gains.table import InputError
 from sitl.aircraft.disturbance import HarmonicGust, SquareDelta
 from sitl.fly import DEFAULT_PORT_BASE, FlightOptions, fly
-from sitl.impairment import PRESETS, parse_link
+from sitl.linkspec import PRESETS, parse_link
 from sitl.plant import DEFAULT_SERVO_TIMEOUT, PlantConfig, PlantNode
 from sitl.processes import ChildDied
 from sitl.relay import RelayNode

@@ -23,7 +23,8 @@ from gains.model import Gains, Model
 from gains.store import load_gains, load_model
 from gains.table import InputError, Table
 from sitl.aircraft.disturbance import HarmonicGust, SquareDelta
-from sitl.impairment import LinkSpec, format_spec, parse_link
+from sitl.impairment import LinkSpec
+from sitl.linkspec import format_spec, parse_link
 from sitl.plant import PlantConfig, PlantNode
 from sitl.relay import RelayNode
 

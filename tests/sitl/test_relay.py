@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 from autopilot.link.node import Node
 from autopilot.link.topics import SCHEMAS
 from sitl import relay as relay_module
-from sitl.impairment import LinkSpec, parse_spec
+from sitl.impairment import LinkSpec
+from sitl.linkspec import parse_spec
 from sitl.relay import MAX_QUEUED, Counters, RelayNode
 
 MS = 1_000_000
