@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -9,7 +10,7 @@ import click
 
 from autopilot.app import AutopilotConfig, AutopilotNode
 from autopilot.link.clock import NS_PER_S, Clock
-from autopilot.link.process import ADDRESS, ProcessOptions, process_options, run_node
+from autopilot.link.process import ADDRESS, FiniteRange, ProcessOptions, process_options, run_node
 from autopilot.link.udp import Address, dial
 from autopilot.reference import parse_profile
 from gains.command import run, version
@@ -55,7 +56,7 @@ MAX_GROUND_STATIONS = 8
 @click.option(
     "--hold",
     "hold_s",
-    type=click.FloatRange(0.0, 60.0),
+    type=FiniteRange(0.0, 60.0),
     default=0.5,
     show_default=True,
     help="Seconds that failsafe holds the last command before neutral.",
@@ -96,10 +97,10 @@ def cli(
         ground_stations=len(stations),
     )
     node = AutopilotNode(config)
-    ports = [dial("plant", plant), *(dial(f"gcs{i}", address) for i, address in enumerate(stations))]
-    click.echo(f"autopilot: gains {gains.name} (no verified certificate), plant {plant[0]}:{plant[1]}", err=True)
+    openers = [partial(dial, "plant", plant), *(partial(dial, f"gcs{i}", a) for i, a in enumerate(stations))]
+    banner = f"autopilot: gains {gains.name} (no verified certificate), plant {plant[0]}:{plant[1]}"
     metadata = {"program": "autopilot", "gains": gains.name, "version": version()}
-    run_node("autopilot", node, ports, ProcessOptions(clock, record, stream), metadata, tap=True)
+    run_node("autopilot", node, openers, ProcessOptions(clock, record, stream), metadata, tap=True, banner=banner)
 
 
 def main() -> None:

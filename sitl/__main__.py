@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from datetime import datetime
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -13,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
 
-from autopilot.link.process import ADDRESS, ProcessOptions, process_options, run_node
+from autopilot.link.process import ADDRESS, FiniteRange, ProcessOptions, process_options, run_node
 from autopilot.link.udp import Address, dial, listen
 from autopilot.link.wire import AUTOPILOT, frames_of
 from gains.command import NEGATIVE, SUCCESS, print_json, run, version
@@ -25,12 +26,13 @@ from sitl.linkspec import PRESETS, parse_link
 from sitl.plant import DEFAULT_SERVO_TIMEOUT, PlantConfig, PlantNode
 from sitl.processes import ChildDied
 from sitl.relay import RelayNode
-from sitl.scenario import Scenario, load_scenario, stored_scenarios
+from sitl.scenario import MAX_SEED, Scenario, load_scenario, stored_scenarios
 from sitl.summary import summary_table
 
 __all__ = ["main"]
 
 INTERRUPTED = 130
+SEED = click.IntRange(0, MAX_SEED)
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"]})
@@ -81,7 +83,7 @@ def _square(text: str) -> SquareDelta:
     help="Samples without a new command after which the elevator goes to neutral; 0 for never.",
 )
 @click.option("--x0", help="State at k = 0, comma-separated; trim by default.")
-@click.option("--gust", "gust_s", type=click.FloatRange(0.0), help="The gust of Eq. (52), from this time in s on.")
+@click.option("--gust", "gust_s", type=FiniteRange(0.0), help="The gust of Eq. (52), from this time in s on.")
 @click.option("--uncertainty", help="Delta(k) of Eq. (51) as AMPLITUDE:HALF_PERIOD, for example 0.15:20.")
 @process_options
 def plant(
@@ -112,9 +114,9 @@ def plant(
         latch,
         servo_timeout or None,
     )
-    ports = [listen("autopilot", address, peer=peer, accept=frames_of(AUTOPILOT))]
+    openers = [partial(listen, "autopilot", address, peer=peer, accept=frames_of(AUTOPILOT))]
     metadata = {"program": "sitl plant", "plant": plant_name, "lagproof": version()}
-    run_node("plant", PlantNode(config), ports, ProcessOptions(**process), metadata, tap=False)
+    run_node("plant", PlantNode(config), openers, ProcessOptions(**process), metadata, tap=False)
 
 
 LINK_OPTIONS = (
@@ -137,7 +139,7 @@ def _link_options(command: Any) -> Any:
 @click.option("--accept", type=click.Choice(["mavlink", "any"]), default="mavlink", show_default=True,
               help="What a client must send to be heard: a frame of the autopilot, or anything.")  # fmt: skip
 @_link_options
-@click.option("--seed", type=click.IntRange(0), default=1, show_default=True)
+@click.option("--seed", type=SEED, default=1, show_default=True)
 @process_options
 def relay(
     address: Address,
@@ -153,9 +155,9 @@ def relay(
     """Delay, lose and reorder what passes between a client and the plant. Runs until Ctrl-C."""
     link = parse_link(preset, up, down)
     heard = frames_of(AUTOPILOT) if accept == "mavlink" else lambda _datagram: True
-    ports = [listen("autopilot", address, peer=peer, accept=heard), dial("plant", to)]
+    openers = [partial(listen, "autopilot", address, peer=peer, accept=heard), partial(dial, "plant", to)]
     metadata = {"program": "sitl relay", "seed": str(seed), "lagproof": version()}
-    run_node("relay", RelayNode(*link, seed), ports, ProcessOptions(**process), metadata, tap=False)
+    run_node("relay", RelayNode(*link, seed), openers, ProcessOptions(**process), metadata, tap=False)
 
 
 @cli.command("fly")
@@ -163,8 +165,8 @@ def relay(
 @click.option("--plant", "plant_name", help="Another plant than the scenario's.")
 @click.option("--gains", "gains_name", help="Other gains than the scenario's.")
 @_link_options
-@click.option("--seed", type=click.IntRange(0), help="Of everything random.")
-@click.option("--duration", type=click.FloatRange(0.0, 86_400.0, min_open=True), help="Seconds.")
+@click.option("--seed", type=SEED, help="Of everything random.")
+@click.option("--duration", type=FiniteRange(0.0, 86_400.0, min_open=True), help="Seconds.")
 @click.option("--virtual", is_flag=True, help="In virtual time: one process, no socket, much faster.")
 @click.option("--actuator", type=click.Choice(["pwm", "float"]), help="SERVO_OUTPUT_RAW or HIL_ACTUATOR_CONTROLS.")
 @click.option("--failsafe", type=click.Choice(["on", "monitor"]), help="monitor: report, but fly the law.")
@@ -196,7 +198,7 @@ def fly_(
     scenario = _changed(scenario, preset, up, down, changes)
     stations = tuple(address for address in gcs if address != "none")
     for address in stations:
-        ADDRESS.convert(address, None, None)
+        dial("gcs", ADDRESS.convert(address, None, None)).socket.close()  # refused now rather than by a program
     folder = out or Path("flights") / f"{scenario.name}-{datetime.now():%Y%m%d-%H%M%S}"
     console = Console(stderr=True)
     try:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import signal
 import tempfile
 from collections.abc import Callable, Iterator
@@ -14,14 +15,13 @@ from typing import Any
 import orjson
 from rich.console import Console
 
-from autopilot.link.clock import NS_PER_MS, NS_PER_US
+from autopilot.link.clock import NS_PER_MS, NS_PER_S, NS_PER_US
 from autopilot.link.node import Record
 from autopilot.link.udp import true_ns
 from gains.command import version
 from gains.table import InputError
 from sitl.flight import fly_virtual
 from sitl.flightdata import FlightData
-from sitl.plot import plot_flight
 from sitl.processes import ChildDied, Supervisor
 from sitl.recorder import FlightRecorder
 from sitl.scenario import Scenario, autopilot_arguments, plant_arguments, relay_arguments
@@ -31,7 +31,8 @@ from sitl.view import FlightView
 __all__ = ["FlightOptions", "Outcome", "fly"]
 
 REFRESH_NS = 100 * NS_PER_MS
-START_UP_LIMIT_NS = 30_000 * NS_PER_MS
+SILENCE_LIMIT_NS = 20 * NS_PER_S
+"""A flight whose plant sends no sample for so long is over."""
 DEFAULT_PORT_BASE = 14600
 
 
@@ -187,17 +188,19 @@ def _fly_in_processes(
         supervisor = Supervisor(folder, write)
         stack.callback(supervisor.close)
         _start_programs(scenario, options, supervisor, interrupted)
-        limit_ns = true_ns() + START_UP_LIMIT_NS
+        seen, seen_ns = 0, true_ns()
         try:
             while flown < scenario.samples and not interrupted():
                 supervisor.poll(REFRESH_NS / 1e9)
                 view.refresh(true_ns() - start_ns)
-                if flown == 0 and true_ns() > limit_ns:
-                    raise InputError("the clockwork did not start: no heartbeat reached the plant")
+                if flown > seen:
+                    seen, seen_ns = flown, true_ns()
+                elif true_ns() - seen_ns > SILENCE_LIMIT_NS:
+                    raise ChildDied("plant", None, f"no sample for {SILENCE_LIMIT_NS // NS_PER_S} s")
         finally:
             killed = supervisor.stop()
         if killed:
-            raise ChildDied(killed[0], -int(signal.SIGTERM), "it did not end when asked to")
+            raise ChildDied(killed[0], None, "it did not end when asked to")
 
 
 def _start_programs(
@@ -211,17 +214,21 @@ def _start_programs(
         supervisor.start("plant", ["sitl", "plant", "--listen", f"127.0.0.1:{plant_port}", *plant_arguments(scenario)])
         if not plant_port:
             plant_port = supervisor.wait_ready("plant", interrupted).get("autopilot", ("", 0))[1]
+        if interrupted():
+            return
         relay = ["--listen", f"127.0.0.1:{relay_port}", "--to", f"127.0.0.1:{plant_port}"]
         supervisor.start("relay", ["sitl", "relay", *relay, *relay_arguments(scenario)])
         if not relay_port:
             relay_port = supervisor.wait_ready("relay", interrupted).get("autopilot", ("", 0))[1]
+        if interrupted():
+            return
         plant = ["--plant", f"udpout:127.0.0.1:{relay_port}"]
         supervisor.start("autopilot", ["autopilot", *plant, *stations, *autopilot_arguments(scenario)])
         for name in ("plant", "relay", "autopilot"):
             supervisor.wait_ready(name, interrupted)
     except ChildDied as death:
         if death.code == 2 and death.last_words:
-            raise InputError(death.last_words.removeprefix("sitl: error: ")) from None
+            raise InputError(re.sub(r"^\w+: error: ", "", death.last_words)) from None
         raise
 
 
@@ -230,6 +237,8 @@ def _conclude(scenario: Scenario, options: FlightOptions, recorder: FlightRecord
     try:
         flight = FlightData.from_records(recorder.kept, scenario.plant, recorder.metadata)
     except ValueError:
+        if interrupted:
+            raise KeyboardInterrupt from None
         raise InputError("the flight ended before its first sample: there is nothing to show") from None
     summary = summarise(scenario, recorder.kept, flight, virtual=options.virtual)
     summary["interrupted"] = interrupted
@@ -239,6 +248,8 @@ def _conclude(scenario: Scenario, options: FlightOptions, recorder: FlightRecord
     files = dict(recorder.files)
     if options.folder is not None:
         files["plot"] = options.folder / "flight.png"
+        from sitl.plot import plot_flight  # slow to import, and the programs that fly have no use for it
+
         plot_flight(files["plot"], flight)
         files["summary"] = options.folder / "summary.json"
     summary["files"] = {name: str(path) for name, path in files.items()}

@@ -184,6 +184,7 @@ class PlantNode:
         if self._next_heartbeat_ns is not None and now_ns >= self._next_heartbeat_ns:
             self._next_heartbeat_ns = following(self._next_heartbeat_ns, NS_PER_S, now_ns)
             self._send(plant_heartbeat())
+            self._record_counters(now_ns)
         flight = self._flight
         if flight is None:
             return
@@ -323,6 +324,11 @@ class PlantNode:
 
     def _send(self, message: Message) -> None:
         self._out.append((PORT, self.wire.encode(message)))
+
+    def _record_counters(self, now_ns: int) -> None:
+        rejects = {kind.value: n for kind, n in self.wire.rejects.items()}
+        refusals = {kind.value: n for kind, n in self.refusals.items()}
+        self._event("counters", "plant counters", now_ns, {"rejects": rejects, "refusals": refusals})
 
     def _event(self, kind: str, text: str, t_ns: int, data: dict[str, object] | None = None) -> None:
         body = {"kind": kind, "node": "plant", "text": text, "data": data or {}}

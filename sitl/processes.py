@@ -51,15 +51,15 @@ class ChildDied(Exception):
     ----------
     name : str
         Which.
-    code : int
-        Its exit code; negative for a signal.
+    code : int or None
+        Its exit code; negative for a signal; None when it had to be ended.
     last_words : str
         The end of its standard error.
     """
 
-    def __init__(self, name: str, code: int, last_words: str) -> None:
-        how = f"signal {-code}" if code < 0 else f"exit code {code}"
-        super().__init__(f"{name} died ({how}): {last_words or 'it said nothing'}")
+    def __init__(self, name: str, code: int | None, last_words: str) -> None:
+        how = "hung" if code is None else f"died (signal {-code})" if code < 0 else f"died (exit code {code})"
+        super().__init__(f"{name} {how}: {last_words or 'it said nothing'}")
         self.name = name
         self.code = code
         self.last_words = last_words
@@ -139,7 +139,8 @@ class Supervisor:
         while child.connection is None and not stopping():
             if monotonic() > deadline:
                 child.process.kill()
-                raise ChildDied(name, child.process.wait(), "it did not report in time")
+                child.process.wait()
+                raise ChildDied(name, None, "it did not report in time")
             self.poll(0.05)
         return child.ports
 
@@ -196,7 +197,7 @@ class Supervisor:
         self._selector.close()
 
     def _accept(self) -> None:
-        with contextlib.suppress(BlockingIOError):
+        with contextlib.suppress(OSError):  # it is gone again, or there is no room for it
             accepted, _ = self._listener.accept()
             accepted.setblocking(False)
             connection = _Connection(accepted)
@@ -207,6 +208,8 @@ class Supervisor:
 
     def _read(self, connection: _Connection) -> None:
         """Take the lines that have come; drop a stream that ends or breaks the rules."""
+        if connection.socket.fileno() < 0:
+            return  # dropped in this very pass, to make room
         try:
             chunk = connection.socket.recv(READ_BYTES)
         except BlockingIOError:

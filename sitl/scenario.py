@@ -29,6 +29,7 @@ from sitl.plant import PlantConfig, PlantNode
 from sitl.relay import RelayNode
 
 __all__ = [
+    "MAX_SEED",
     "Check",
     "Scenario",
     "autopilot_arguments",
@@ -44,6 +45,9 @@ DEFAULT_CLOCKS: Mapping[str, str] = {
     "autopilot": "1042s:-60ppm",
 }
 """No two clocks agree unless a scenario says so: mixed-up clocks fail at once."""
+
+MAX_SEED = 2**63 - 1
+"""Largest seed: it fits the integers of a summary."""
 
 SERVO_TIMEOUT_MARGIN = 5
 """The plant's servo time-out is d_max and this many samples, unless a scenario says otherwise."""
@@ -197,7 +201,7 @@ def _parse(table: Table, name: str, gains_name: str | None, plant_name: str | No
         gains=gains,
         plant=plant,
         duration_s=table.number("duration_s", above=0.0, high=86_400.0),
-        seed=table.integer("seed", default=1, low=0),
+        seed=table.integer("seed", default=1, low=0, high=MAX_SEED),
         reference=table.string("reference", default=""),
         up=up,
         down=down,

@@ -43,7 +43,7 @@ MAX_DELAY = 64
 ROOMY_ROWS = 34
 """From this height on, blank lines part the groups."""
 SHOWN_EVENTS = 4
-SILENT_EVENTS = frozenset({"counters", "gains"})
+SILENT_EVENTS = frozenset({"counters", "gains", "ports"})
 STALE_S = 0.5
 LABEL = 10
 OUTPUT_STYLE, REFERENCE_STYLE, DIM, ALARM = "cyan", "magenta", "bright_black", "bold red"
@@ -202,10 +202,9 @@ class FlightView:
         style = ""
         if kind == "gains":
             state.verified = bool(data.get("verified"))
-        elif kind in ("failsafe", "mode"):
-            mode = str(data.get("to", data.get("mode", "")))
-            if mode in MODE_STYLES:
-                state.mode, style = mode, MODE_STYLES[mode]
+        elif kind == "failsafe":
+            state.mode = data["to"]
+            style = MODE_STYLES[state.mode]
         elif kind in ("fault", "diverged"):
             style = ALARM
         if kind not in SILENT_EVENTS:

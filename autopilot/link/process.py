@@ -7,10 +7,11 @@ between two passes, the records are passed on, the files are closed.
 from __future__ import annotations
 
 import gc
+import math
 import re
 import signal
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -24,7 +25,16 @@ from autopilot.link.stream import StreamSink
 from autopilot.link.udp import Address, RecordSink, UdpDriver, UdpPort, parse_address, true_ns
 from gains.table import InputError
 
-__all__ = ["ADDRESS", "CLOCK", "ProcessOptions", "format_clock", "parse_clock", "process_options", "run_node"]
+__all__ = [
+    "ADDRESS",
+    "CLOCK",
+    "FiniteRange",
+    "ProcessOptions",
+    "format_clock",
+    "parse_clock",
+    "process_options",
+    "run_node",
+]
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -84,6 +94,17 @@ class _Parsed(click.ParamType[Any]):
         return self._parse(value) if isinstance(value, str) else value
 
 
+class FiniteRange(click.FloatRange):
+    """A range of numbers that NaN and infinity are not in."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """Parse a number and refuse those that are none."""
+        number = super().convert(value, param, ctx)
+        if not math.isfinite(number):
+            self.fail(f"{value} is not a finite number.", param, ctx)
+        return number
+
+
 ADDRESS = _Parsed("ADDRESS", parse_address)
 CLOCK = _Parsed("CLOCK", parse_clock)
 
@@ -126,11 +147,12 @@ class _FileSink:
 def run_node(
     name: str,
     node: Node,
-    ports: Sequence[UdpPort],
+    openers: Sequence[Callable[[], UdpPort]],
     options: ProcessOptions,
     metadata: Mapping[str, str],
     *,
     tap: bool,
+    banner: str = "",
 ) -> None:
     """Run a node over UDP until Ctrl-C, SIGTERM or the end of the record stream.
 
@@ -138,14 +160,18 @@ def run_node(
     ----------
     name : str
         The program.
-    node, ports
-        The node, and its sockets, control ports first.
+    node : Node
+        What runs.
+    openers : sequence of callable
+        Each opens one of the node's ports, control ports first.
     options : ProcessOptions
         Clock and recordings.
     metadata : mapping
         Of the program's own recording.
     tap : bool
         Whether datagrams are recorded.
+    banner : str
+        What is said once everything is open.
 
     Raises
     ------
@@ -161,6 +187,10 @@ def run_node(
     for signum in (signal.SIGINT, signal.SIGTERM):
         signal.signal(signum, stop)
     with ExitStack() as stack:
+        ports: list[UdpPort] = []
+        for open_port in openers:
+            ports.append(open_port())
+            stack.callback(ports[-1].socket.close)  # whatever else cannot be opened
         sink: RecordSink | None = None
         stream: StreamSink | None = None
         if options.stream is not None:
@@ -173,8 +203,17 @@ def run_node(
             except OSError as error:
                 raise InputError(f"{options.record}: {error.strerror or error}") from None
             sink = _FileSink(recorder)
+        if banner:
+            click.echo(banner, err=True)
         gc.collect()
         gc.freeze()  # what is loaded now stays: no later collection has to look at it
-        driver = UdpDriver(node, ports, options.clock, sink, tap=tap)
-        stack.callback(driver.close)
+        driver = stack.enter_context(closing(UdpDriver(node, ports, options.clock, sink, tap=tap)))
         driver.run(lambda: stopped or (stream is not None and stream.closed))
+        if sink is not None:
+            sink.write(_port_counters(name, ports, driver.clock.node_ns(true_ns())), true_ns())
+
+
+def _port_counters(name: str, ports: Sequence[UdpPort], t_ns: int) -> Record:
+    """Return the event that says what the ports refused and could not send."""
+    data = {port.name: {"strangers": port.strangers, "unsent": port.unsent} for port in ports}
+    return Record("events", t_ns, {"kind": "ports", "node": name, "text": f"{name} ports", "data": data})

@@ -155,6 +155,8 @@ def dial(name: str, address: Address) -> UdpPort:
     InputError
         When the address cannot be resolved or reached.
     """
+    if address[1] == 0:
+        raise InputError(f"address {address[0]}:0: expected a port to send to, found 0")
     family, resolved = _resolve(address)
     sock = _socket(family)
     try:
@@ -176,13 +178,13 @@ def listen(
         When the address is busy, not ours, or cannot be resolved.
     """
     family, resolved = _resolve(address)
+    fixed = _resolve(peer)[1] if peer is not None else None
     sock = _socket(family)
     try:
         sock.bind(resolved)
     except OSError as error:
         sock.close()
         raise InputError(f"address {address[0]}:{address[1]}: {error.strerror}") from None
-    fixed = _resolve(peer)[1] if peer is not None else None
     return UdpPort(name, sock, fixed, accept if peer is None else None, connected=False)
 
 

@@ -13,7 +13,7 @@ import pytest
 
 from autopilot.link.clock import Clock
 from sitl.flight import fly_virtual
-from sitl.impairment import parse_link
+from sitl.linkspec import parse_link
 from sitl.recorder import FlightRecorder
 from sitl.scenario import Scenario, load_scenario
 from tests.integration.recursion import deviation, tables
