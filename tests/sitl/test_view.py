@@ -207,7 +207,7 @@ def test_saturation_and_servo_timeout_are_flagged_only_while_they_last():
 
 
 def test_the_last_four_events_are_shown_with_their_time_and_counters_are_not():
-    view = fed([truth(0), *(event("failsafe", f"event {i}") for i in range(6)), event("counters", "counters")])
+    view = fed([truth(0), *(event("clockwork", f"event {i}") for i in range(6)), event("counters", "counters")])
     shown = [line.split() for line in lines_of(view) if "autopilot" in line]
     assert [(line[0], line[-1]) for line in shown] == [("0.07", "2"), ("0.10", "3"), ("0.12", "4"), ("0.15", "5")]
 
