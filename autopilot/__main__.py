@@ -10,12 +10,13 @@ import click
 
 from autopilot.app import AutopilotConfig, AutopilotNode
 from autopilot.link.clock import NS_PER_S, Clock
-from autopilot.link.process import ADDRESS, FiniteRange, ProcessOptions, process_options, run_node
+from autopilot.link.process import ADDRESS, ProcessOptions, process_options, run_node
 from autopilot.link.udp import Address, dial
 from autopilot.reference import parse_profile
-from gains.command import run, version
+from gains.command import FiniteRange, run, version
 from gains.store import load_gains
 from gains.table import InputError
+from gains.verify import verified
 
 __all__ = ["main"]
 
@@ -83,8 +84,9 @@ def cli(
     hears its one peer and nobody else.
     """
     gains = load_gains(gains_name)
-    if require_certificate:
-        raise InputError(f"gains {gains.name}: no verified certificate, and --require-certificate is given")
+    proof = verified(gains)
+    if require_certificate and not proof.passed:
+        raise InputError(f"gains {gains.name}: no verified certificate ({proof.reason}), but --require-certificate")
     stations = [ADDRESS.convert(text, None, None) for text in gcs if text != "none"]
     if len(stations) > MAX_GROUND_STATIONS:
         raise InputError(f"--gcs: expected at most {MAX_GROUND_STATIONS} ground stations, found {len(stations)}")
@@ -98,7 +100,8 @@ def cli(
     )
     node = AutopilotNode(config)
     openers = [partial(dial, "plant", plant), *(partial(dial, f"gcs{i}", a) for i, a in enumerate(stations))]
-    banner = f"autopilot: gains {gains.name} (no verified certificate), plant {plant[0]}:{plant[1]}"
+    proved = "certificate verified" if proof.passed else "no verified certificate"
+    banner = f"autopilot: gains {gains.name} ({proved}), plant {plant[0]}:{plant[1]}"
     metadata = {"program": "autopilot", "gains": gains.name, "version": version()}
     run_node("autopilot", node, openers, ProcessOptions(clock, record, stream), metadata, tap=True, banner=banner)
 

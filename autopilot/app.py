@@ -37,6 +37,7 @@ from autopilot.reference import Profile, ReferenceModel, match_reference
 from autopilot.state import JUMP_BACK_NS, Sample, SampleAssembler
 from autopilot.vehicle import Vehicle
 from gains.model import Gains
+from gains.verify import verified
 
 __all__ = ["AutopilotConfig", "AutopilotNode"]
 
@@ -98,12 +99,13 @@ class AutopilotNode:
     Raises
     ------
     InputError
-        When the model cannot be flown over MAVLink (sensors, actuator).
+        When the model cannot be flown over MAVLink (sensors, actuator), or a certificate is malformed.
     """
 
     def __init__(self, config: AutopilotConfig) -> None:
         self.config = config
         self.model = config.gains.model
+        self.proof = verified(config.gains)
         self.wire = Wire(AUTOPILOT, PLANT)
         self.clock = ClockSync()
         self.delay = DelayEstimator(self.model.Ts_ns)
@@ -371,15 +373,17 @@ class AutopilotNode:
         self._out.append((PLANT_PORT, self.wire.encode(message)))
 
     def _banner(self) -> list[StatusText]:
-        """Return what a ground station must know at start: gains without proof say so."""
-        gains = self.config.gains
-        text = f"no verified certificate: gains {gains.name}"
-        return [StatusText(Severity.WARNING, text)]
+        """Return what a ground station must know at start: whether what it flies is proved."""
+        if self.proof.passed:
+            return [StatusText(Severity.INFO, f"certificate verified: gains {self.config.gains.name}")]
+        return [StatusText(Severity.WARNING, f"no verified certificate: gains {self.config.gains.name}")]
 
     def _announce_gains(self, now_ns: int) -> None:
-        gains = self.config.gains
-        data = {"gains": gains.name, "d_min": gains.d_min, "d_max": gains.d_max, "verified": False}
-        self._event("gains", self.vehicle.banner[0].text, now_ns, data)
+        gains, proof = self.config.gains, self.proof
+        data = {"gains": gains.name, "d_min": gains.d_min, "d_max": gains.d_max}
+        self._event(
+            "gains", self.vehicle.banner[0].text, now_ns, data | {"verified": proof.passed, "reason": proof.reason}
+        )
 
     def _event(self, kind: str, text: str, now_ns: int, data: dict[str, object] | None = None) -> None:
         body = {"kind": kind, "node": "autopilot", "text": text, "data": data or {}}

@@ -1,4 +1,4 @@
-"""The ``gains`` command: models and gains, listed and shown."""
+"""The ``gains`` command: models and gains listed and shown; :mod:`gains.proving` has the other commands."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from rich.table import Table as Grid
 
 from gains.command import print_json, run, version
 from gains.model import Gains, Matrix, Model
+from gains.proving import JSON_OPTION, bound, certify, design
 from gains.store import load, load_gains, load_model, stored
+from gains.verify import verified
 
 __all__ = ["cli", "main"]
-
-JSON_OPTION = click.option("--json", "as_json", is_flag=True, help="Print one JSON object on standard output.")
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"]})
@@ -62,6 +62,10 @@ def show(name: str, as_json: bool) -> None:
         _show_model(_console(), item)
     else:
         _show_gains(_console(), item)
+
+
+for command in (certify, bound, design):
+    cli.add_command(command)
 
 
 def main() -> None:
@@ -176,7 +180,7 @@ def _show_gains(console: Console, gains: Gains) -> None:
     console.print(_matrix("K1", gains.K1, inputs, gains.model.states))
     if gains.K2 is not None:
         console.print(_matrix("K2", gains.K2, inputs, _labels("xr", gains.model.nr)))
-    console.print(f"certificate: {_certificate(gains)}")
+    console.print(f"certificate: {_certificate(gains)}", soft_wrap=True)
 
 
 def _model_line(model: Model) -> str:
@@ -193,7 +197,14 @@ def _gains_line(gains: Gains) -> str:
 
 
 def _certificate(gains: Gains) -> str:
-    return "none" if gains.certificate is None else "present, not verified by this version"
+    if gains.certificate is None:
+        return "none"
+    verification = verified(gains)
+    if not verification.passed:
+        return f"present, not verified: {verification.reason}"
+    eta, delta = gains.certificate.get("eta"), gains.certificate.get("delta_max")
+    claim = "stability" if eta is None else f"eta {eta:.6g}"
+    return f"verified: {claim}, ||Delta|| <= {delta:g}, margin {verification.margin:.2g}"
 
 
 def _eigenvalues(A: Matrix) -> list[complex]:

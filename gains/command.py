@@ -7,12 +7,13 @@ Exit 0 on success; 1 when the answer is negative or undecided; 2 on bad input, w
 from __future__ import annotations
 
 import io
+import math
 import os
 import sys
 from collections.abc import Mapping
 from importlib import metadata
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
 
 import click
 import numpy as np
@@ -20,13 +21,24 @@ import orjson
 
 from gains.table import InputError
 
-__all__ = ["BAD_INPUT", "NEGATIVE", "SUCCESS", "print_json", "run", "version"]
+__all__ = ["BAD_INPUT", "NEGATIVE", "SUCCESS", "FiniteRange", "print_json", "run", "version"]
 
 SUCCESS = 0
 NEGATIVE = 1
 BAD_INPUT = 2
 _INTERRUPTED = 130
 _BROKEN_PIPE = 141
+
+
+class FiniteRange(click.FloatRange):
+    """A range of numbers that NaN and infinity are not in."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """Parse a number and refuse those that are none."""
+        number = super().convert(value, param, ctx)
+        if not math.isfinite(number):
+            self.fail(f"{value} is not a finite number.", param, ctx)
+        return number
 
 
 def version() -> str:

@@ -18,6 +18,7 @@ from scipy.linalg import expm
 
 __all__ = [
     "Actuator",
+    "Augmented",
     "Condition",
     "Gains",
     "Matrix",
@@ -25,6 +26,7 @@ __all__ = [
     "Reference",
     "Trim",
     "Uncertainty",
+    "augmented",
     "read_only",
     "spectral_radius",
     "zero_order_hold",
@@ -260,6 +262,79 @@ class Gains:
         assert self.K1.shape == (self.model.nu, self.model.nx)
         assert (self.K2 is None) == (self.model.reference is None)
         assert self.K2 is None or self.K2.shape == (self.model.nu, self.model.nr)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Augmented:
+    """The closed loop over z = [x; xr], v = [w; r], e = y − yr, Eqs. (10) and (11).
+
+        z(k+1) = A z(k) + A1 z(k−d(k)) + B v(k),   e(k) = C z(k) + C1 z(k−d(k))
+
+    with the uncertainty [ΔA ΔA1] = F Δ [J1 J2], ‖Δ‖ ≤ 1, where the model has one; B, C and C1 are certain.
+
+    Attributes
+    ----------
+    A, A1 : ndarray, shape (n, n)
+        n = nx + nr.
+    B : ndarray, shape (n, m)
+        m = nw + number of reference inputs; may be 0.
+    C, C1 : ndarray, shape (ny, n)
+    F : ndarray, shape (n, rows of Δ)
+        F̄ = [F; 0], as in the model, not scaled by its delta_max; no columns without uncertainty.
+    J1, J2 : ndarray, shape (columns of Δ, n)
+        J̄1 = [J1, J2 K2] and J̄2 = [J2 K1, 0]; no rows without uncertainty.
+    """
+
+    A: Matrix
+    A1: Matrix
+    B: Matrix
+    C: Matrix
+    C1: Matrix
+    F: Matrix
+    J1: Matrix
+    J2: Matrix
+
+    def __post_init__(self) -> None:
+        _freeze(self)
+
+    @property
+    def n(self) -> int:
+        """Number of states of plant and reference model together."""
+        return int(self.A.shape[0])
+
+
+def augmented(model: Model, K1: Matrix, K2: Matrix | None) -> Augmented:
+    """Return the closed loop of a model under the law (9): the calligraphic matrices of Eqs. (10), (11).
+
+    Parameters
+    ----------
+    model : Model
+    K1 : ndarray, shape (nu, nx)
+    K2 : ndarray or None, shape (nu, nr)
+        None where the model has no reference.
+    """
+    nx, nr, nw, ny = model.nx, model.nr, model.nw, model.ny
+    reference, uncertainty = model.reference, model.uncertainty
+    none = np.zeros
+    F, J1, J2 = none((nx, 0)), none((0, nx)), none((0, model.nu))
+    if uncertainty is not None:
+        F, J1, J2 = uncertainty.F, uncertainty.J1, uncertainty.J2
+    Ar, Br, Cr = none((0, 0)), none((0, 0)), none((ny, 0))
+    if reference is not None:
+        Ar, Br, Cr = reference.Ar, reference.Br, reference.Cr
+    if K2 is None:
+        K2 = none((model.nu, 0))
+    q = J1.shape[0]
+    return Augmented(
+        A=np.block([[model.A, model.B @ K2], [none((nr, nx)), Ar]]),
+        A1=np.block([[model.B @ K1, none((nx, nr))], [none((nr, nx + nr))]]),
+        B=np.block([[model.E, none((nx, Br.shape[1]))], [none((nr, nw)), Br]]),
+        C=np.hstack([model.C, model.D @ K2 - Cr]),
+        C1=np.hstack([model.D @ K1, none((ny, nr))]),
+        F=np.vstack([F, none((nr, F.shape[1]))]),
+        J1=np.hstack([J1, J2 @ K2]),
+        J2=np.hstack([J2 @ K1, none((q, nr))]),
+    )
 
 
 def zero_order_hold(Ap: Matrix, Bp: Matrix, Ts: float) -> tuple[Matrix, Matrix]:

@@ -6,14 +6,19 @@ The quantities of [reference] and [uncertainty] are discrete at Ts, also where t
 
 from __future__ import annotations
 
+import contextlib
 import difflib
+import os
 import re
+import tempfile
 from importlib import resources
 from pathlib import Path
 from typing import Literal, NamedTuple
 
 import numpy as np
+import tomli_w
 
+from gains.certificate import gains_hash, model_hash
 from gains.model import (
     Actuator,
     Condition,
@@ -34,9 +39,11 @@ __all__ = [
     "load",
     "load_gains",
     "load_model",
+    "model_path",
     "parse_gains",
     "parse_model",
     "resolve",
+    "save_gains",
     "stored",
 ]
 
@@ -153,12 +160,7 @@ def parse_gains(table: Table) -> Gains:
     if "window" in table:
         raise table.error("window", "K1 and K2", "a schedule; schedules are not supported by this version")
     name = table.string("name")
-    reference = table.string("model")
-    try:
-        path = resolve(reference, table.folder)
-    except InputError as error:
-        raise InputError(f"{table.source}: model: {error}") from None
-    model = parse_model(Table.load(path))
+    model = parse_model(Table.load(_model_path(table)))
     d_min = table.integer("d_min", low=0, high=DELAY_LIMIT)
     d_max = table.integer("d_max", low=d_min, high=DELAY_LIMIT)
     K1 = table.matrix("K1", shape=(model.nu, model.nx))
@@ -168,8 +170,75 @@ def parse_gains(table: Table) -> Gains:
     elif "K2" in table:
         raise table.error("K2", f"none, as model {model.name} has no [reference]", "one")
     certificate = table.mapping("certificate", None)
+    if certificate is not None:
+        _check_hashes(Table(certificate, table.source, "certificate"), model, K1, K2)
     table.finish()
     return Gains(name, model, d_min, d_max, K1, K2, certificate)
+
+
+def model_path(gains_name_or_path: str | Path) -> Path:
+    """Return the file of the model that a gain file names.
+
+    Raises
+    ------
+    InputError
+        When there is no such file, or it names none.
+    """
+    return _model_path(Table.load(resolve(gains_name_or_path)))
+
+
+def save_gains(path: str | Path, gains: Gains, model: str | Path) -> None:
+    """Write a gain file, with its certificate if it has one; a file of that name is replaced at once or not at all.
+
+    Parameters
+    ----------
+    path : str or Path
+    gains : Gains
+        Every number is written at full double precision.
+    model : str or Path
+        The stored name or the file of the model; the file names it relative to itself.
+    """
+    path, file = Path(path), resolve(model)
+    stored_names = {stored_file: name for name, stored_file in _stored_paths().items()}
+    reference = stored_names.get(file) or os.path.relpath(file.resolve(), path.resolve().parent)
+    content: dict[str, object] = {"name": gains.name, "model": reference, "d_min": gains.d_min, "d_max": gains.d_max}
+    content["K1"] = gains.K1.tolist()
+    if gains.K2 is not None:
+        content["K2"] = gains.K2.tolist()
+    if gains.certificate is not None:
+        content["certificate"] = dict(gains.certificate)
+    handle, temporary = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
+    try:
+        with os.fdopen(handle, "wb") as out:
+            tomli_w.dump(content, out)
+        mask = os.umask(0)
+        os.umask(mask)
+        os.chmod(temporary, 0o666 & ~mask)
+        os.replace(temporary, path)
+    except BaseException:
+        with contextlib.suppress(OSError):
+            os.unlink(temporary)
+        raise
+
+
+def _model_path(table: Table) -> Path:
+    try:
+        return resolve(table.string("model"), table.folder)
+    except InputError as error:
+        prefix = f"{table.source}: "
+        raise InputError(str(error) if str(error).startswith(prefix) else f"{prefix}model: {error}") from None
+
+
+def _check_hashes(table: Table, model: Model, K1: Matrix, K2: Matrix | None) -> None:
+    """Refuse a certificate that was made for another model or other gains."""
+    hashes = table.table("sha256")
+    for key, actual in (("model", model_hash(model)), ("gains", gains_hash(K1, K2))):
+        expected = hashes.string(key)
+        if expected != actual:
+            what = f"model {model.name}" if key == "model" else "K1 and K2"
+            raise hashes.error(
+                key, f"the hash of {what}, {actual[:12]}…", f"{expected[:12]}…: made for another, or changed"
+            )
 
 
 def _stored_paths() -> dict[str, Path]:

@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
 
-from autopilot.link.process import ADDRESS, FiniteRange, ProcessOptions, process_options, run_node
+from autopilot.link.process import ADDRESS, ProcessOptions, process_options, run_node
 from autopilot.link.udp import Address, dial, listen
 from autopilot.link.wire import AUTOPILOT, frames_of
-from gains.command import NEGATIVE, SUCCESS, print_json, run, version
+from gains.command import NEGATIVE, SUCCESS, FiniteRange, print_json, run, version
 from gains.store import load_model
 from gains.table import InputError
 from sitl.aircraft.disturbance import HarmonicGust, SquareDelta

@@ -12,6 +12,8 @@ from rich.table import Table as Grid
 from rich.text import Text
 
 from autopilot.failsafe import Mode
+from gains.model import Gains
+from gains.verify import verified
 from sitl.flightdata import FlightData
 from sitl.scenario import Check, Scenario
 
@@ -65,7 +67,7 @@ def summarise(scenario: Scenario, kept: Sequence[Kept], flight: FlightData, *, v
         "plant": scenario.plant.name,
         "seed": scenario.seed,
         "virtual": virtual,
-        "certificate": "none verified",
+        "certificate": _certificate(scenario.gains),
         "duration_s": len(flight.time_s) * scenario.plant.Ts,
         "samples": len(flight.time_s),
         "diverged": any(topic == "events" and body["kind"] == "diverged" for topic, _, body in kept),
@@ -82,6 +84,16 @@ def summarise(scenario: Scenario, kept: Sequence[Kept], flight: FlightData, *, v
         "reentry_saturation_s": _reentry_saturation_s(flight),
         "late_ticks": int(np.count_nonzero(flight.late_ns > LATE_NS)),
     }
+
+
+def _certificate(gains: Gains) -> str:
+    """Return what is proved of the gains, in a few words."""
+    proof = verified(gains)
+    if not proof.passed or gains.certificate is None:
+        return "none verified"
+    eta = gains.certificate.get("eta")
+    gain = f", eta {eta:.4g}" if isinstance(eta, float) else ""
+    return f"verified for d = {gains.d_min}..{gains.d_max}{gain}"
 
 
 def delay_summary(flight: FlightData) -> dict[str, Any]:

@@ -7,7 +7,6 @@ between two passes, the records are passed on, the files are closed.
 from __future__ import annotations
 
 import gc
-import math
 import re
 import signal
 from collections.abc import Callable, Mapping, Sequence
@@ -28,7 +27,6 @@ from gains.table import InputError
 __all__ = [
     "ADDRESS",
     "CLOCK",
-    "FiniteRange",
     "ProcessOptions",
     "format_clock",
     "parse_clock",
@@ -92,17 +90,6 @@ class _Parsed(click.ParamType[Any]):
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         """Parse text; pass on what is parsed already."""
         return self._parse(value) if isinstance(value, str) else value
-
-
-class FiniteRange(click.FloatRange):
-    """A range of numbers that NaN and infinity are not in."""
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """Parse a number and refuse those that are none."""
-        number = super().convert(value, param, ctx)
-        if not math.isfinite(number):
-            self.fail(f"{value} is not a finite number.", param, ctx)
-        return number
 
 
 ADDRESS = _Parsed("ADDRESS", parse_address)

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from rich.console import Console
 from rich.table import Table
 
-from tests.bench import flight, turnaround
+from tests.bench import certify, flight, turnaround
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,11 @@ class Row:
 
 
 def main() -> int:
-    benches: list[Callable[[], list[tuple[str, float, float, str]]]] = [flight.measure, turnaround.measure]
+    benches: list[Callable[[], list[tuple[str, float, float, str]]]] = [
+        certify.measure,
+        flight.measure,
+        turnaround.measure,
+    ]
     rows = [Row(*row) for bench in benches for row in bench()]
     table = Table("measured", "ratio", "limit", "", title=f"{platform.machine()}, Python {platform.python_version()}")
     for row in rows:

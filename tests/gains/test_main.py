@@ -9,7 +9,9 @@ import pytest
 from click.testing import CliRunner
 
 from gains.__main__ import cli
+from gains.certificate import gains_hash, model_hash
 from gains.store import load_gains, load_model, resolve
+from gains.verify import verified
 
 ROOT = Path(__file__).parents[2]
 
@@ -71,12 +73,83 @@ def test_show_prints_matrices_with_the_names_of_the_states() -> None:
         assert part in text
 
 
-def test_a_certificate_is_shown_as_present_and_not_verified(tmp_path: Path) -> None:
+def test_a_certificate_is_verified_before_it_is_shown_as_one(tmp_path: Path) -> None:
+    path, text = tmp_path / "g.toml", resolve("hirm-paper").read_text()
+    gains = load_gains("hirm-paper")
+    hashes = f'sha256 = {{model = "{model_hash(gains.model)}", gains = "{gains_hash(gains.K1, gains.K2)}"}}\n'
+    path.write_text(text + f'[certificate]\nmethod = "other"\n{hashes}')
+    shown = "present, not verified: method 'other' cannot be verified by this version"
+    assert f"certificate: {shown}" in invoke("show", str(path))
+    assert json.loads(invoke("show", str(path), "--json"))["certificate"] == shown
+
+
+def test_certify_proves_writes_and_show_verifies(tmp_path: Path) -> None:
+    path = tmp_path / "proved.toml"
+    result = process("certify", "hirm-paper", "--delay", "1:3", "--delta", "0.15", "--json", "-o", str(path))
+    assert result.returncode == 0
+    answer = json.loads(result.stdout)
+    assert list(answer) == [
+        "verdict", "eta", "eta_lower", "d_min", "d_max", "transitions", "method", "delta_max", "margin", "witness",
+        "growth_per_sample", "seconds", "reason",
+    ]  # fmt: skip
+    assert answer["verdict"] == "stable"
+    assert answer["eta"] == pytest.approx(1.015, rel=0.01)
+    assert (answer["d_min"], answer["d_max"], answer["delta_max"]) == (1, 3, 0.15)
+    assert answer["margin"] > 0
+    assert "certifying" in result.stderr
+    gains = load_gains(path)
+    assert (gains.d_min, gains.d_max) == (1, 3)
+    assert verified(gains).passed
+    assert "certificate: verified: eta 1.01469, ||Delta|| <= 0.15" in invoke("show", str(path))
+
+
+def test_certify_undecided_exits_1_and_writes_nothing(tmp_path: Path) -> None:
     path = tmp_path / "g.toml"
-    path.write_text(resolve("hirm-paper").read_text() + '[certificate]\nmethod = "exact"\n')
-    assert "certificate: present, not verified by this version" in invoke("show", str(path))
-    shown = json.loads(invoke("show", str(path), "--json"))
-    assert shown["certificate"] == "present, not verified by this version"
+    result = process("certify", "hirm-paper", "--json", "-o", str(path))
+    assert result.returncode == 1
+    answer = json.loads(result.stdout)
+    assert (answer["verdict"], answer["eta"], answer["margin"], answer["d_max"]) == ("undecided", None, None, 4)
+    assert "sufficient" in answer["reason"]
+    assert "not written" in result.stderr
+    assert not path.exists()
+    result = process("certify", "hirm-paper", "--method", "printed", "--delay", "1:1")
+    assert result.returncode == 1
+    assert "eigenvalue" in result.stdout or "spectral radius" in result.stdout
+
+
+def test_bound_finds_the_largest_delay() -> None:
+    answer = json.loads(process("bound", "pendulum-paper", "--json").stdout)
+    assert list(answer) == [
+        "d_min", "d_max", "seconds_of_latency", "limit", "method", "transitions", "refuted", "seconds",
+    ]  # fmt: skip
+    assert (answer["d_max"], answer["limit"], answer["method"], answer["refuted"]) == (5, 20, "lyapunov", None)
+    assert answer["seconds_of_latency"] == pytest.approx(0.15)
+    answer = json.loads(process("bound", "pendulum-paper", "--method", "constant", "--json").stdout)
+    assert answer["d_max"] == 7
+    assert (answer["refuted"]["d_max"], answer["refuted"]["witness"]) == (8, [8])
+    assert answer["refuted"]["growth_per_sample"] == pytest.approx(1.0087, abs=1e-4)
+    result = process("bound", "pendulum-paper", "--d-min", "6")
+    assert result.returncode == 1
+    assert "none from 6" in result.stdout
+
+
+@pytest.mark.parametrize(
+    ("arguments", "stderr"),
+    [
+        (["certify", "hirm-paper", "--delay", "3"], "--delay: expected MIN:MAX in samples, such as 1:3, found '3'"),
+        (["certify", "hirm-paper", "--delay", "3:1"], "--delay: expected MIN <= MAX <= 1000, found 3:1"),
+        (["certify", "hirm-paper", "--delay", "0:0"], "--delay: expected a window up to at least 1 sample, found 0:0"),
+        (["certify", "pendulum-paper", "--delta", "0.1"], "expected 0, as model pendulum has no [uncertainty]"),
+        (["certify", "hirm"], "expected a gain file (model, K1), found a model file"),
+        (["bound", "hirm-paper", "--d-min", "5", "--limit", "4"], "--limit: expected at least d_min (5), found 4"),
+    ],
+)
+def test_bad_input_of_the_proofs_exits_2_with_one_line(arguments: list[str], stderr: str) -> None:
+    result = process(*arguments)
+    assert result.returncode == 2
+    assert result.stdout == ""
+    assert stderr in result.stderr
+    assert result.stderr.count("\n") == 1
 
 
 def test_names_in_files_are_shown_as_they_are(tmp_path: Path) -> None:
