@@ -34,7 +34,7 @@ from autopilot.link.wire import (
     autopilot_heartbeat,
 )
 from autopilot.reference import Profile, ReferenceModel, match_reference
-from autopilot.state import JUMP_BACK_NS, Sample, SampleAssembler
+from autopilot.state import JUMP_BACK_NS, Drop, Sample, SampleAssembler
 from autopilot.vehicle import Vehicle
 from gains.model import Gains
 from gains.verify import verified
@@ -122,6 +122,7 @@ class AutopilotNode:
         self._u = self.travel.neutral
         self._last: Sample | None = None
         self._fresh_ns: int | None = None
+        self._first_j: int | None = None
         self._steps_seen = 0
         self._started_ns: int | None = None
         self._next_heartbeat_ns: int | None = None
@@ -213,23 +214,29 @@ class AutopilotNode:
 
     def _timesync(self, message: Timesync, now_ns: int) -> None:
         if message.tc1 == 0:
-            self._send(Timesync(now_ns, message.ts1))
+            self._send(Timesync(max(1, now_ns), message.ts1))  # a reply of 0 would be a request
             return
         steps = self.clock.steps
         if self.clock.answer(message.tc1, message.ts1, now_ns) is None:
             return
         if self.clock.steps > steps:
             self.delay.forget()
+            self.samples.forget_number()
             self._event("clock", f"plant clock stepped by {self.clock.last_step_ns / NS_PER_S:+.3f} s", now_ns)
         self.delay.transit(message.tc1, message.ts1, now_ns)
 
     def _named_value(self, message: NamedValueInt, now_ns: int) -> None:
         if message.name == "SAMPLE_K":
+            stepped = self.clock.steps > self._steps_seen
+            if stepped and self._last is not None and message.value <= self._last.j:
+                self._new_epoch(now_ns)
             sample = self.samples.number(message.value, message.time_boot_ms, self.clock.peer_at_most_ns(now_ns))
             if sample is not None:
                 self._command(sample, now_ns)
         elif message.name == "DELAY_K":
             self.vehicle.show(message, now_ns)
+            if not self.samples.counts_from(message.time_boot_ms, message.value, self._first_j):
+                return  # the command of an autopilot before this one, or of another epoch
             if not self.config.gains.d_min <= message.value <= self.config.gains.d_max:
                 self._failsafe_step(Event.OUTSIDE, f"delay {message.value} reported", now_ns)
 
@@ -242,7 +249,7 @@ class AutopilotNode:
         self._steps_seen = self.clock.steps
         self.samples.restart()
         self.reference = self._new_reference()
-        self._last = self._fresh_ns = None
+        self._last = self._fresh_ns = self._first_j = None
         self._u = self.travel.neutral
         self._event("epoch", f"plant restarted, epoch {self.epoch}", now_ns)
         self._failsafe_step(Event.RESTARTED, "plant restarted", now_ns)
@@ -252,6 +259,7 @@ class AutopilotNode:
     def _command(self, sample: Sample, now_ns: int) -> None:
         """Compute and send the command of one sample."""
         if self._last is not None and sample.j <= self._last.j:
+            self.samples.drops[Drop.LATE] += 1
             return
         self._steps_seen = self.clock.steps
         gains = self.config.gains
@@ -261,13 +269,15 @@ class AutopilotNode:
         if self._fresh_ns is not None and now_ns - self._fresh_ns > self._stale_ns:
             self._failsafe_step(Event.STALE, "a gap before this sample", now_ns)
         self._fresh_ns, self._last = now_ns, sample
+        if self._first_j is None:
+            self._first_j = sample.j
         reason = "delay unknown" if forecast.d is None else f"delay {forecast.d}"
         self._failsafe_step(Event.GOOD if inside else Event.OUTSIDE, reason, now_ns)
+        ahead = min(forecast.d, MAX_AHEAD) if forecast.d is not None else gains.d_min
         if self.reference is not None:
             self.reference.advance(sample.j)
             if self.failsafe.mode is Mode.TRACKING and was in (Mode.HOLD, Mode.NEUTRAL):
-                self._match_reference(sample)
-        ahead = min(forecast.d, MAX_AHEAD) if forecast.d is not None else gains.d_min
+                self._match_reference(sample, ahead)
         xr = self.reference.ahead(ahead) if self.reference is not None else ()
         saturated = False
         if self.failsafe.mode is Mode.TRACKING or self.config.failsafe == "monitor":
@@ -278,13 +288,14 @@ class AutopilotNode:
         self._send_command(sample)
         self._untold.append(_Command(now_ns, sample, forecast, xr, self._u, saturated, self.failsafe.mode))
 
-    def _match_reference(self, sample: Sample) -> None:
+    def _match_reference(self, sample: Sample, ahead: int) -> None:
         """Let the reference go on from where the aircraft is: re-entry without a jump of the elevator."""
         gains = self.config.gains
         if self.reference is None or gains.K2 is None or self.config.failsafe == "monitor":
             return
         dx = np.array(sample.x) - self.model.trim.x
-        self.reference.set(match_reference(self.model, gains.K1, gains.K2, dx, self._u - self.travel.neutral))
+        du, step_ahead = self._u - self.travel.neutral, self.reference.step_ahead(ahead)
+        self.reference.set(match_reference(self.model, gains.K1, gains.K2, dx, du, step_ahead))
 
     def _send_command(self, sample: Sample) -> None:
         stamp_us = sample.t_ns // NS_PER_US
@@ -414,6 +425,8 @@ class AutopilotNode:
             "rejects": {kind.value: n for kind, n in self.wire.rejects.items()},
             "drops": {kind.value: n for kind, n in self.samples.drops.items()},
             "timesync_unmatched": self.clock.unmatched,
+            "ground": {port: {k.value: n for k, n in w.rejects.items()} for port, w in self.vehicle.wires.items()},
+            "telemetry_refused": self.vehicle.refused,
             "clock": clock.status,
             "clock_bound_ns": clock.bound_ns,
         }

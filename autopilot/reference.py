@@ -13,6 +13,7 @@ import math
 import re
 from collections import deque
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +21,7 @@ from numpy.typing import NDArray
 from gains.model import Model, Reference
 from gains.table import InputError
 
-__all__ = ["Profile", "ReferenceModel", "match_reference", "parse_profile"]
+__all__ = ["AffineStep", "Profile", "ReferenceModel", "match_reference", "parse_profile"]
 
 LOOP_LIMIT = 64
 """Up to so many steps are taken one by one; a longer stretch of constant r is one matrix power."""
@@ -91,6 +92,13 @@ def parse_profile(text: str, Ts: float) -> Profile:
     return Profile(tuple(switches))
 
 
+class AffineStep(NamedTuple):
+    """xr later = matrix @ xr + offset."""
+
+    matrix: Vector
+    offset: Vector
+
+
 class ReferenceModel:
     """State of Eq. (8), driven by a profile.
 
@@ -140,6 +148,12 @@ class ReferenceModel:
             self._states.append(self._propagate(self._states[-1], at, at + 1))
         return tuple(self._states[samples].tolist())
 
+    def step_ahead(self, samples: int) -> AffineStep:
+        """Return how xr(k + samples) follows from xr(k)."""
+        end = self.k + samples
+        matrix = np.linalg.matrix_power(self.reference.Ar, samples)
+        return AffineStep(matrix, self._propagate(np.zeros(matrix.shape[0]), self.k, end))
+
     def _propagate(self, xr: Vector, start: int, end: int) -> Vector:
         """Return xr(end) from xr(start)."""
         Ar, Br = self.reference.Ar, self.reference.Br[:, 0]
@@ -158,22 +172,25 @@ class ReferenceModel:
         return xr
 
 
-def match_reference(model: Model, K1: Vector, K2: Vector, x: Vector, u: float) -> Vector:
-    """Return the xr with which the law continues from (x, u) without a jump.
+def match_reference(model: Model, K1: Vector, K2: Vector, x: Vector, u: float, ahead: AffineStep) -> Vector:
+    """Return the xr(j) with which the command of sample j continues from u without a jump.
 
-    Solves Cr xr = C x and K2 xr = u - K1 x as closely as possible, staying nearest to x itself where the
-    reference model has the plant's states (as in model following, Eq. (53)), else nearest to zero.
+    Solves Cr xr = C x and K2 xr(j + d) = u - K1 x as closely as possible, xr(j + d) being what the command will
+    use; it stays nearest to x itself where the reference model has the plant's states (as in model following,
+    Eq. (53)), else nearest to zero.
 
     Parameters
     ----------
     x : (nx,) array
-        Deviation from trim.
+        Deviation from trim at sample j.
     u : float
         Deviation of the input that is applied now.
+    ahead : AffineStep
+        From xr(j) to xr(j + d).
     """
     assert model.reference is not None
     Cr = model.reference.Cr
     base = x if Cr.shape[1] == x.size else np.zeros(Cr.shape[1])
-    rows = np.vstack([Cr, K2])
-    wanted = np.concatenate([model.C @ x, u - K1 @ x])
+    rows = np.vstack([Cr, K2 @ ahead.matrix])
+    wanted = np.concatenate([model.C @ x, u - K1 @ x - K2 @ ahead.offset])
     return np.asarray(base + np.linalg.pinv(rows, rcond=1e-6) @ (wanted - rows @ base))

@@ -119,6 +119,11 @@ class SampleAssembler:
         self._waiting = None
         self._first = None
 
+    def forget_number(self) -> None:
+        """Wait for the plant's next number: its clock has stepped, and stamps do not count samples across that."""
+        self._number = None
+        self._first = None
+
     def add(self, message: Measurement, now_ns: int, peer_ns: int | None = None) -> Sample | None:
         """Take one measurement; return the sample it completes.
 
@@ -154,6 +159,14 @@ class SampleAssembler:
             return None
         waiting, self._waiting = self._waiting, None
         return self._sample(*waiting)
+
+    def counts_from(self, time_boot_ms: int, d: int, first_j: int | None) -> bool:
+        """Whether a delay d reported at a stamp is that of a command not older than the one of sample ``first_j``."""
+        if first_j is None or self._number is None:
+            return False
+        k, at_ns = self._number
+        reported_k = k + round((self._unwrap_ms(time_boot_ms, None) - at_ns) / self._Ts_ns)
+        return reported_k - d >= first_j
 
     def _stamp_ns(self, message: Measurement, peer_ns: int | None) -> int:
         if isinstance(message, AoaSsa):

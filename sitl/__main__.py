@@ -22,9 +22,9 @@ from gains.store import load_model
 from gains.table import InputError
 from sitl.aircraft.disturbance import HarmonicGust, SquareDelta
 from sitl.fly import DEFAULT_PORT_BASE, FlightOptions, fly
-from sitl.linkspec import PRESETS, parse_link
+from sitl.linkspec import PRESETS, parse_link, parse_spec
 from sitl.plant import DEFAULT_SERVO_TIMEOUT, PlantConfig, PlantNode
-from sitl.processes import ChildDied
+from sitl.processes import FlightFailed
 from sitl.relay import RelayNode
 from sitl.scenario import MAX_SEED, Scenario, load_scenario, stored_scenarios
 from sitl.summary import summary_table
@@ -199,12 +199,12 @@ def fly_(
     stations = tuple(address for address in gcs if address != "none")
     for address in stations:
         dial("gcs", ADDRESS.convert(address, None, None)).socket.close()  # refused now rather than by a program
-    folder = out or Path("flights") / f"{scenario.name}-{datetime.now():%Y%m%d-%H%M%S}"
+    folder = out or _new_folder(f"{scenario.name}-{datetime.now():%Y%m%d-%H%M%S}")
     console = Console(stderr=True)
     try:
         outcome = fly(scenario, FlightOptions(virtual, folder, stations, port_base), console)
-    except ChildDied as death:
-        click.echo(f"sitl: error: {death}", err=True)
+    except FlightFailed as failure:
+        click.echo(f"sitl: error: {failure}", err=True)
         return NEGATIVE
     if as_json:
         print_json(outcome.summary)
@@ -215,6 +215,20 @@ def fly_(
     return SUCCESS if outcome.passed else NEGATIVE
 
 
+def _new_folder(name: str) -> Path:
+    """Make and return a folder below ``flights`` that no other flight has."""
+    for suffix in ("", *(f"-{n}" for n in range(2, 1000))):
+        folder = Path("flights") / f"{name}{suffix}"
+        try:
+            folder.mkdir(parents=True)
+        except FileExistsError:
+            continue
+        except OSError as error:
+            raise InputError(f"{folder}: {error.strerror or error}") from None
+        return folder
+    raise InputError(f"flights/{name}: expected fewer than a thousand flights in one second")
+
+
 def _changed(
     scenario: Scenario, preset: str | None, up: str | None, down: str | None, changes: dict[str, Any]
 ) -> Scenario:
@@ -222,8 +236,9 @@ def _changed(
     given = {name: value for name, value in changes.items() if value is not None}
     if "duration" in given:
         given["duration_s"] = given.pop("duration")
-    if preset or up or down:
-        given["up"], given["down"] = parse_link(preset, up, down)
+    if preset is not None:
+        given["up"], given["down"] = parse_link(preset, None, None)
+    given |= {way: parse_spec(text) for way, text in (("up", up), ("down", down)) if text is not None}
     variants = {name: replace(variant, **given) for name, variant in scenario.variants.items()}
     return replace(scenario, **given, variants=variants)
 

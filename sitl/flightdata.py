@@ -6,13 +6,15 @@ are then placed where they were in true time, and the reference model starts fro
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from bisect import bisect_right
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
+from autopilot.reference import parse_profile
 from gains.model import Matrix, Model
 
 __all__ = ["FlightData", "FlightEvent", "LinkPackets", "ModeInterval"]
@@ -143,7 +145,7 @@ class FlightData:
         time_s = np.asarray(samples * model.Ts, dtype=np.float64)
         x, u = _rows(truth, "x", model.nx), _rows(truth, "u", model.nu)
         deviation = (x - model.trim.x) @ model.C.T + (u - model.trim.u) @ model.D.T
-        yr = _reference_outputs(model, samples, found.starts, found.commands)
+        yr = _reference_outputs(model, samples, found.starts, _reference_inputs(model, found, metadata or {}))
         trim = model.C @ model.trim.x + model.D @ model.trim.u
 
         places = sorted(found.commands)
@@ -251,29 +253,43 @@ class _Collected:
         return LinkPackets(entered_s, np.where(arrived, (left_ns - sent_ns) / 1e9, np.nan))
 
 
-def _reference_outputs(
-    model: Model, samples: NDArray[np.int64], starts: list[int], commands: Mapping[int, Mapping[str, Any]]
-) -> Matrix:
-    """Return yr(k) = Cr xr(k), xr(k+1) = Ar xr(k) + Br r(k), xr(0) = 0 (8); 0 without a reference.
+def _reference_inputs(model: Model, found: _Collected, metadata: Mapping[str, str]) -> Callable[[int], Matrix]:
+    """Return r as a function of the sample: the recording's programmed reference, else what commands recorded.
 
-    r(k) is what the command of sample k recorded; without one the last is held. Shape (N, ny).
+    A sample whose command is missing does not say what r was; the last one known then stands in.
     """
+    if "reference" in metadata:
+        profile = parse_profile(metadata["reference"], model.Ts)
+        return lambda sample: np.array([profile.r(sample - max(s for s in found.starts if s <= sample))])
+    width = 0 if model.reference is None else model.reference.Br.shape[1]
+    known = {place: body["r"] for place, body in found.commands.items() if body["r"] is not None}
+    places = sorted(known)
+
+    def recorded(sample: int) -> Matrix:
+        i, start = bisect_right(places, sample), max(s for s in found.starts if s <= sample)
+        known_since_start = i > 0 and places[i - 1] >= start
+        return np.array(known[places[i - 1]], dtype=np.float64) if known_since_start else np.zeros(width)
+
+    return recorded
+
+
+def _reference_outputs(
+    model: Model, samples: NDArray[np.int64], starts: list[int], r: Callable[[int], Matrix]
+) -> Matrix:
+    """Return yr(k) = Cr xr(k), xr(k+1) = Ar xr(k) + Br r(k), xr(0) = 0 (8); 0 without a reference, shape (N, ny)."""
     yr = np.zeros((len(samples), model.ny))
     reference = model.reference
     if reference is None:
         return yr
     rows = {int(sample): row for row, sample in enumerate(samples)}
     restarts = set(starts)
-    xr, r = np.zeros(model.nr), np.zeros(reference.Br.shape[1])
+    xr = np.zeros(model.nr)
     for sample in range(int(samples[-1]) + 1):
         if sample in restarts:
-            xr, r = np.zeros(model.nr), np.zeros(reference.Br.shape[1])
+            xr = np.zeros(model.nr)
         if sample in rows:
             yr[rows[sample]] = reference.Cr @ xr
-        command = commands.get(sample)
-        if command is not None and command["r"] is not None:
-            r = np.asarray(command["r"], dtype=np.float64)
-        xr = reference.Ar @ xr + reference.Br @ r
+        xr = reference.Ar @ xr + reference.Br @ r(sample)
     return yr
 
 

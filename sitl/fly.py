@@ -22,7 +22,7 @@ from gains.command import version
 from gains.table import InputError
 from sitl.flight import fly_virtual
 from sitl.flightdata import FlightData
-from sitl.processes import ChildDied, Supervisor
+from sitl.processes import ChildDied, FlightFailed, Supervisor
 from sitl.recorder import FlightRecorder
 from sitl.scenario import Scenario, autopilot_arguments, plant_arguments, relay_arguments
 from sitl.summary import Verdict, judge, summarise
@@ -33,6 +33,7 @@ __all__ = ["FlightOptions", "Outcome", "fly"]
 REFRESH_NS = 100 * NS_PER_MS
 SILENCE_LIMIT_NS = 20 * NS_PER_S
 """A flight whose plant sends no sample for so long is over."""
+NO_SAMPLE = f"no sample within {SILENCE_LIMIT_NS // NS_PER_S} s: does the link pass anything?"
 DEFAULT_PORT_BASE = 14600
 
 
@@ -89,13 +90,14 @@ def fly(scenario: Scenario, options: FlightOptions, console: Console) -> Outcome
     ------
     InputError
         When a file or an address is not to be had.
-    ChildDied
-        When one of the programs ended by itself; the files are complete up to then.
+    FlightFailed
+        When one of the programs ended by itself, or no sample came; the files are complete up to then.
     """
     unix_us = 0 if options.virtual else time_ns() // NS_PER_US
     with ExitStack() as stack:
         interrupted = stack.enter_context(_interruptible())
-        recorder = stack.enter_context(FlightRecorder(options.folder, _metadata(scenario, options), unix_us))
+        tlog_port = "gcs0" if options.ground_stations else "plant"
+        recorder = stack.enter_context(FlightRecorder(options.folder, _metadata(scenario, options), unix_us, tlog_port))
         view = stack.enter_context(FlightView(scenario, console, virtual=options.virtual))
         if options.virtual:
             _fly_in_process(scenario, options, recorder, view, interrupted)
@@ -117,6 +119,7 @@ def _metadata(scenario: Scenario, options: FlightOptions) -> dict[str, str]:
         "plant": scenario.plant_name,
         "Ts": repr(scenario.plant.Ts),
         "actuator": scenario.actuator,
+        "reference": scenario.reference,
         "time": "virtual" if options.virtual else "udp",
         "lagproof": version(),
     }
@@ -196,9 +199,10 @@ def _fly_in_processes(
                 if flown > seen:
                     seen, seen_ns = flown, true_ns()
                 elif true_ns() - seen_ns > SILENCE_LIMIT_NS:
-                    raise ChildDied("plant", None, f"no sample for {SILENCE_LIMIT_NS // NS_PER_S} s")
+                    raise FlightFailed(NO_SAMPLE)
         finally:
             killed = supervisor.stop()
+            recorder.malformed = supervisor.malformed
         if killed:
             raise ChildDied(killed[0], None, "it did not end when asked to")
 
@@ -239,7 +243,7 @@ def _conclude(scenario: Scenario, options: FlightOptions, recorder: FlightRecord
     except ValueError:
         if interrupted:
             raise KeyboardInterrupt from None
-        raise InputError("the flight ended before its first sample: there is nothing to show") from None
+        raise FlightFailed(NO_SAMPLE) from None
     summary = summarise(scenario, recorder.kept, flight, virtual=options.virtual)
     summary["interrupted"] = interrupted
     if not interrupted:
@@ -265,7 +269,7 @@ def _conclude(scenario: Scenario, options: FlightOptions, recorder: FlightRecord
 
 def _fly_beside(variant: Scenario) -> dict[str, Any]:
     """Fly a variant in virtual time and return its summary."""
-    with FlightRecorder(None, {}) as recorder:
+    with FlightRecorder(None, {"reference": variant.reference}) as recorder:
         fly_virtual(variant, recorder.write)
-    flight = FlightData.from_records(recorder.kept, variant.plant)
+    flight = FlightData.from_records(recorder.kept, variant.plant, recorder.metadata)
     return summarise(variant, recorder.kept, flight, virtual=True)

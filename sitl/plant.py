@@ -3,7 +3,7 @@
 The clockwork. Sample k = 0 is the first instant of the grid i Ts (plant's clock) after the first heartbeat
 of the autopilot; until then the state is held. At sample k the plant latches the command that holds over
 [k, k+1), senses x(k) and sends it, and integrates to x(k+1). A late wake-up catches up sample by sample;
-what counts is when a command arrived, not when the plant woke up.
+what counts is when a command arrived (over UDP: when its socket was read), not when the plant woke up.
 """
 
 from __future__ import annotations
@@ -170,7 +170,7 @@ class PlantNode:
                     if self._flight is None:
                         self._start(now_ns)
                 case Timesync(tc1=0):
-                    self._send(Timesync(now_ns, message.ts1))
+                    self._send(Timesync(max(1, now_ns), message.ts1))  # a reply of 0 would be a request
                 case ServoOutputRaw():
                     self._take(message.time_usec, True, self.travel.from_pwm(message.servo2_raw), now_ns)
                 case HilActuatorControls():

@@ -28,7 +28,7 @@ from autopilot.link.record import MAX_LINE_BYTES, decode_line
 from autopilot.link.stream import TOKEN_VARIABLE
 from autopilot.link.udp import Address
 
-__all__ = ["ChildDied", "Supervisor"]
+__all__ = ["ChildDied", "FlightFailed", "Supervisor"]
 
 READ_BYTES = 1 << 18
 HELLO_TIMEOUT_S = 30.0
@@ -44,7 +44,11 @@ else:
 """Ctrl-C in the terminal reaches the supervisor alone, which then ends the others in order."""
 
 
-class ChildDied(Exception):
+class FlightFailed(Exception):
+    """A flight that came to nothing, through nobody's bad input."""
+
+
+class ChildDied(FlightFailed):
     """A process ended that should not have.
 
     Attributes

@@ -36,6 +36,8 @@ class FlightRecorder:
         Of the MCAP file.
     unix_us : int
         Unix time of the start of the flight, for the tlog; 0 in virtual time, where there is none.
+    tlog_port : str
+        The port whose frames the tlog holds: one link, as a ground station would have logged it.
 
     Attributes
     ----------
@@ -43,6 +45,8 @@ class FlightRecorder:
         All records but frames.
     unkept : int
         Records beyond MAX_KEPT.
+    malformed : int
+        Records that came from another process and were none.
 
     Raises
     ------
@@ -50,12 +54,16 @@ class FlightRecorder:
         When the folder or the files cannot be made.
     """
 
-    def __init__(self, folder: Path | None, metadata: Mapping[str, str], unix_us: int = 0) -> None:
+    def __init__(
+        self, folder: Path | None, metadata: Mapping[str, str], unix_us: int = 0, tlog_port: str = "gcs0"
+    ) -> None:
         self.kept: list[Kept] = []
         self.unkept = 0
+        self.malformed = 0
         self.metadata = dict(metadata)
         self.files: dict[str, Path] = {}
         self._unix_us = unix_us
+        self._tlog_topic = f"mavlink/{tlog_port}"
         self._mcap: McapRecorder | None = None
         self._tlog: TlogWriter | None = None
         if folder is None:
@@ -71,7 +79,7 @@ class FlightRecorder:
     def write(self, record: Record, log_time_ns: int) -> None:
         """Take a record made ``log_time_ns`` after the start of the flight."""
         if record.topic.startswith("mavlink/"):
-            if self._tlog is not None:
+            if self._tlog is not None and record.topic == self._tlog_topic:
                 time_us = self._unix_us + log_time_ns // NS_PER_US
                 for frame in split_frames(base64.b64decode(record.body["frame"]))[0]:
                     self._tlog.write(frame, time_us)
@@ -85,9 +93,16 @@ class FlightRecorder:
     @property
     def problems(self) -> list[str]:
         """What went wrong with the files, for the summary."""
-        problems = [f"{type(w).__name__}: {w.error}" for w in (self._mcap, self._tlog) if w is not None and w.error]
+        problems = [f"{w.error}: {w.lost} lost" for w in (self._mcap, self._tlog) if w is not None and w.error]
+        if self._mcap is not None and self._mcap.refused:
+            problems.append(f"{self._mcap.refused} records of too many topics are not in the files")
         if self.unkept:
             problems.append(f"{self.unkept} records are in the files only: the summary leaves them out")
+        for topic, _, body in self.kept:
+            if topic == "events" and body["kind"] == "ports" and body["data"]["records_lost"]:
+                problems.append(f"{body['node']} could not record {body['data']['records_lost']} records")
+        if self.malformed:
+            problems.append(f"{self.malformed} malformed records were dropped")
         return problems
 
     def close(self) -> None:

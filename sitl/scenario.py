@@ -6,6 +6,7 @@ from a scenario, for either driver, and writes the command lines that build the 
 
 from __future__ import annotations
 
+import difflib
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from importlib import resources
@@ -49,8 +50,32 @@ DEFAULT_CLOCKS: Mapping[str, str] = {
 MAX_SEED = 2**63 - 1
 """Largest seed: it fits the integers of a summary."""
 
+LINK_COUNTS = ("sent", "delivered", "lost", "duplicated", "reordered")
+
 SERVO_TIMEOUT_MARGIN = 5
 """The plant's servo time-out is d_max and this many samples, unless a scenario says otherwise."""
+
+
+METRICS = frozenset(
+    {
+        "duration_s",
+        "samples",
+        "rms_error_rad",
+        "max_error_rad",
+        "final_error_rad",
+        "max_output_rad",
+        "delay.estimated_exact_fraction",
+        "delay.within_one_fraction",
+        "delay.unknown_fraction",
+        *(f"link.{way}.{n}" for way in ("up", "down") for n in LINK_COUNTS),
+        "failsafe_events",
+        "mode_at_end",
+        "longest_saturation_s",
+        "reentry_saturation_s",
+        "late_ticks",
+    }
+)
+"""What of a summary a check may judge; of a variant's too, after ``variants.NAME.``."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -193,6 +218,7 @@ def _parse(table: Table, name: str, gains_name: str | None, plant_name: str | No
     link = table.table("link", default=None)
     up, down = parse_link(*((link.string(key, default=None) if link else None) for key in ("preset", "up", "down")))
     clocks = table.table("clocks", default=None)
+    variants = table.table("variant", default=None)
     scenario = Scenario(
         name=name,
         title=table.string("title"),
@@ -213,10 +239,9 @@ def _parse(table: Table, name: str, gains_name: str | None, plant_name: str | No
         x0=table.vector("x0", length=plant.nx, default=None),
         gust=_gust(table, plant),
         delta=_delta(table, plant),
-        checks=tuple(_check(t) for t in table.tables("check", default=())),
+        checks=tuple(_check(check, tuple(variants or ())) for check in table.tables("check", default=())),
     )
     parse_profile(scenario.reference, gains.model.Ts)
-    variants = table.table("variant", default=None)
     if variants is None:
         return scenario
     return replace(scenario, variants={v: _variant(scenario, variants.table(v)) for v in variants})
@@ -255,7 +280,8 @@ def _delta(table: Table, plant: Model) -> SquareDelta | None:
     return SquareDelta(delta.number("amplitude", default=0.15), delta.integer("half_period", default=20, low=1))
 
 
-def _check(table: Table) -> Check:
+def _check(table: Table, variants: tuple[str, ...]) -> Check:
+    """Return a check, its metric one that there will be."""
     check = Check(
         table.string("name"),
         table.string("metric"),
@@ -265,6 +291,12 @@ def _check(table: Table) -> Check:
     )
     if check.at_most is None and check.at_least is None and check.equals is None:
         raise table.error("at_most", "at_most, at_least or equals", "none")
+    known = {*METRICS, *(f"variants.{variant}.{metric}" for variant in variants for metric in METRICS)}
+    if check.metric not in known:
+        near = difflib.get_close_matches(check.metric, known, 1)
+        raise table.error(
+            "metric", f"a number of the summary, such as {near[0] if near else 'rms_error_rad'}", check.metric
+        )
     return check
 
 

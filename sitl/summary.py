@@ -15,7 +15,7 @@ from autopilot.failsafe import Mode
 from gains.model import Gains
 from gains.verify import verified
 from sitl.flightdata import FlightData
-from sitl.scenario import Check, Scenario
+from sitl.scenario import LINK_COUNTS, Check, Scenario
 
 __all__ = ["LATE_NS", "Verdict", "delay_summary", "judge", "link_summary", "summarise", "summary_table"]
 
@@ -121,7 +121,7 @@ def link_summary(kept: Iterable[Kept]) -> dict[str, dict[str, int]]:
     """Return the packet counts of each direction; ``sent`` counts each packet once, the others its copies."""
     summary = {}
     for way in ("up", "down"):
-        summary[way] = dict.fromkeys(("sent", "delivered", "lost", "duplicated", "reordered"), 0)
+        summary[way] = dict.fromkeys(LINK_COUNTS, 0)
     newest = {"up": 0, "down": 0}
     for topic, _, body in kept:
         if not topic.startswith("link/"):

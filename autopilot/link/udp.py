@@ -273,8 +273,8 @@ class UdpDriver:
     def _serve(self, port: UdpPort) -> None:
         """Hand the node a bounded number of datagrams, sending its answers at once."""
         for _ in range(MAX_PER_PASS):
-            at_ns = true_ns()
-            datagram = port.receive(at_ns)
+            datagram = port.receive(true_ns())
+            at_ns = true_ns()  # not before it came: clocks are compared by this
             if datagram is None:
                 return
             if not datagram:

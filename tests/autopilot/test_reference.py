@@ -11,12 +11,13 @@ from hypothesis import strategies as st
 from scipy.signal import dlsim
 
 from autopilot import reference as reference_module
-from autopilot.reference import Profile, ReferenceModel, match_reference, parse_profile
+from autopilot.reference import AffineStep, Profile, ReferenceModel, match_reference, parse_profile
 from gains.table import InputError
 from tests.helpers import HIRM
 
 quick = settings(deadline=None)
 REFERENCE = HIRM.model.reference
+AT_ONCE = AffineStep(np.eye(3), np.zeros(3))
 SWITCHES = st.lists(st.integers(0, 400), max_size=5, unique=True).flatmap(
     lambda starts: st.lists(st.floats(-1.0, 1.0), min_size=len(starts), max_size=len(starts)).map(
         lambda values: Profile(tuple(zip(sorted(starts), values, strict=True)))
@@ -160,14 +161,14 @@ def test_r_is_constant_as_long_as_it_says(profile, k, span):
     st.floats(-0.4, 0.4),
 )
 def test_a_matched_reference_has_the_aircrafts_output_and_its_input(x, u):
-    xr = match_reference(HIRM.model, HIRM.K1, HIRM.K2, x, u)
+    xr = match_reference(HIRM.model, HIRM.K1, HIRM.K2, x, u, AT_ONCE)
     np.testing.assert_allclose(REFERENCE.Cr @ xr, HIRM.model.C @ x, atol=1e-9)
     np.testing.assert_allclose(HIRM.K2 @ xr, u - HIRM.K1 @ x, atol=1e-9)
 
 
 def test_a_matched_reference_stays_nearest_to_the_state():
     x, u = np.array([0.02, -0.1, 0.05]), 0.03
-    xr = match_reference(HIRM.model, HIRM.K1, HIRM.K2, x, u)
+    xr = match_reference(HIRM.model, HIRM.K1, HIRM.K2, x, u, AT_ONCE)
     rows = np.vstack([REFERENCE.Cr, HIRM.K2])
     free = np.linalg.svd(rows)[2][2]
     np.testing.assert_allclose(rows @ free, 0.0, atol=1e-12)
@@ -177,4 +178,22 @@ def test_a_matched_reference_stays_nearest_to_the_state():
 def test_a_reference_that_matches_already_is_left_alone():
     x = np.array([0.02, -0.1, 0.05])
     u = float((HIRM.K1 @ x + HIRM.K2 @ x)[0])
-    np.testing.assert_allclose(match_reference(HIRM.model, HIRM.K1, HIRM.K2, x, u), x, atol=1e-12)
+    np.testing.assert_allclose(match_reference(HIRM.model, HIRM.K1, HIRM.K2, x, u, AT_ONCE), x, atol=1e-12)
+
+
+@pytest.mark.parametrize("ahead", [0, 1, 3, 7])
+def test_the_command_after_a_match_is_the_input_before_it_however_far_the_law_looks_ahead(ahead):
+    model = ReferenceModel(REFERENCE, Profile(((0, 0.1), (12, -0.2))))
+    model.advance(10)
+    x, u = np.array([0.02, -0.1, 0.05]), 0.03
+    model.set(match_reference(HIRM.model, HIRM.K1, HIRM.K2, x, u, model.step_ahead(ahead)))
+    np.testing.assert_allclose(HIRM.K1 @ x + HIRM.K2 @ model.ahead(ahead), u, atol=1e-9)
+    np.testing.assert_allclose(REFERENCE.Cr @ model.xr, HIRM.model.C @ x, atol=1e-9)
+
+
+@pytest.mark.parametrize("ahead", [0, 1, 5])
+def test_the_step_ahead_is_the_look_ahead(ahead):
+    model = ReferenceModel(REFERENCE, Profile(((0, 0.1), (12, -0.2))))
+    model.advance(10)
+    step = model.step_ahead(ahead)
+    np.testing.assert_allclose(step.matrix @ model.xr + step.offset, model.ahead(ahead), atol=1e-12)

@@ -13,6 +13,7 @@ import pytest
 
 from autopilot.link.clock import Clock
 from sitl.flight import fly_virtual
+from sitl.flightdata import FlightData
 from sitl.linkspec import parse_link
 from sitl.recorder import FlightRecorder
 from sitl.scenario import Scenario, load_scenario
@@ -79,3 +80,24 @@ def test_a_flight_across_a_wrap_of_the_plants_stamps_is_the_recursion(wraps_at_s
     assert truth[0]["t_ns"] < wraps_at_s * 1e9 < truth[-1]["t_ns"]
     assert max(body["d"] for body in truth if body["d"] is not None) <= 3
     assert deviation(scenario, truth, commands) < 1e-5
+
+
+def test_clocks_that_all_start_at_zero_fly_too() -> None:
+    scenario = load_scenario("nominal")
+    up, down = parse_link("perfect", None, None)
+    clocks = dict.fromkeys(scenario.clocks, Clock())
+    truth, commands = fly(replace(scenario, actuator="float", up=up, down=down, clocks=clocks))
+    assert len(truth) == 400
+    assert deviation(scenario, truth, commands) < 1e-5
+
+
+def test_the_error_of_an_outage_is_against_the_reference_that_was_programmed() -> None:
+    scenario = replace(load_scenario("blackout"), reference="5deg@1s,0deg@2s")
+    recorder = FlightRecorder(None, {"reference": scenario.reference})
+    fly_virtual(scenario, recorder.write)
+    flight = FlightData.from_records(recorder.kept, scenario.plant, recorder.metadata)
+    reference, xr = scenario.plant.reference, np.zeros(3)
+    assert reference is not None
+    for k in range(scenario.samples):
+        assert abs(flight.reference[k, 0] - (reference.Cr @ xr)[0]) < 1e-12
+        xr = reference.Ar @ xr + reference.Br[:, 0] * (np.radians(5.0) if 40 <= k < 80 else 0.0)
