@@ -9,6 +9,7 @@ by name; :mod:`gains.verify` is what makes a proof.
 from __future__ import annotations
 
 import hashlib
+import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -18,10 +19,13 @@ import numpy as np
 from gains.model import Gains, Matrix, Model, read_only
 from gains.table import Table
 
-__all__ = ["METHODS", "Certificate", "gains_hash", "model_hash", "read_certificate"]
+__all__ = ["MAX_DELAY", "METHODS", "Certificate", "claim_hash", "gains_hash", "model_hash", "read_certificate"]
 
 METHODS = ("lyapunov", "printed")  # proofs by P, Q, R; other methods leave other matrices
 _QUANTUM = 1e-10
+
+MAX_DELAY = 1_000_000
+"""Samples; a window beyond it is no window."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -74,7 +78,7 @@ class Certificate:
             What computed it.
         """
         eta = {} if self.eta is None else {"eta": float(self.eta)}
-        return {
+        claim: dict[str, object] = {
             "method": self.method,
             "transitions": self.transitions,
             "d_min": self.d_min,
@@ -84,9 +88,13 @@ class Certificate:
             "margin": float(margin),
             "mu": float(self.mu),
             **{name: getattr(self, name).tolist() for name in ("P", "Q", "R")},
-            "sha256": {"model": model_hash(gains.model), "gains": gains_hash(gains.K1, gains.K2)},
-            "versions": dict(versions),
         }
+        hashes = {
+            "model": model_hash(gains.model),
+            "gains": gains_hash(gains.K1, gains.K2),
+            "certificate": claim_hash(claim),
+        }
+        return {**claim, "sha256": hashes, "versions": dict(versions)}
 
 
 def read_certificate(gains: Gains, source: str = "certificate") -> Certificate | None:
@@ -104,8 +112,8 @@ def read_certificate(gains: Gains, source: str = "certificate") -> Certificate |
     return Certificate(
         method=table.string("method"),
         transitions=table.string("transitions", choices=("any", "fifo")),
-        d_min=table.integer("d_min", low=0),
-        d_max=table.integer("d_max", low=1),
+        d_min=table.integer("d_min", low=0, high=MAX_DELAY),
+        d_max=table.integer("d_max", low=1, high=MAX_DELAY),
         delta_max=table.number("delta_max", low=0.0),
         eta=table.number("eta", None, above=0.0),
         mu=table.number("mu", 0.0, low=0.0),
@@ -138,6 +146,12 @@ def gains_hash(K1: Matrix, K2: Matrix | None) -> str:
         if K is not None:
             digest.update(f"{name} {K.shape} {(K + 0.0).tolist()}\n".encode())  # + 0.0: no negative zeros
     return digest.hexdigest()
+
+
+def claim_hash(certificate: Mapping[str, object]) -> str:
+    """Return the SHA-256 of what a [certificate] table claims and proves it with: all but hashes and versions."""
+    claim = {key: value for key, value in certificate.items() if key not in ("sha256", "versions")}
+    return hashlib.sha256(json.dumps(claim, sort_keys=True, default=str).encode()).hexdigest()
 
 
 def _add(digest: hashlib._Hash, name: str, matrix: Matrix) -> None:

@@ -252,13 +252,23 @@ def _run(search: _Search, problem: Task, K: Matrix | None, method: str, iteratio
 def _proven(search: _Search, history: list[Step], notes: list[str]) -> Design:
     """Return the best step that verifies."""
     whole = sorted((step for step in history if step.share == 1.0), key=lambda step: step.eta)
+    stabilising: tuple[Step, Analysis] | None = None
     for step in whole[:_MAX_CHECKED]:
         analysis = search.analysis(step.gains)
-        if analysis.verdict != "stable" or (analysis.eta is None and search.empty.model is search.aim):
+        if analysis.verdict != "stable":
+            continue
+        if analysis.eta is None and search.empty.model is search.aim:
+            stabilising = stabilising or (step, analysis)
             continue
         objective = analysis.eta if search.empty.model is search.aim else search.analysis(step.gains, weighted=True).eta
         gains = search.gains(step.gains)
+        if search.method == "printed":
+            notes.append(f"the printed condition gives eta {step.eta:.6g}; the certificate is that of Lemma 1")
         return Design(gains, analysis.eta, objective, analysis, tuple(history), tuple(notes))
+    if stabilising is not None:
+        step, analysis = stabilising
+        notes.append("the gains are proved stable, but no eta was proved for them")
+        return Design(search.gains(step.gains), None, None, analysis, tuple(history), tuple(notes))
     reach = max((step.share for step in history), default=0.0)
     reason = "no gains were found for which the sufficient condition holds"
     if whole:

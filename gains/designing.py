@@ -87,7 +87,7 @@ _clock = time.perf_counter  # noqa: TID251  a command says how long it took
 
 
 class _Reporter:
-    """Progress of a design on standard error: a live line on a terminal, now and then a plain one elsewhere."""
+    """Progress of a design on standard error: a live line on a terminal, a plain one per step elsewhere."""
 
     def __init__(self) -> None:
         self._console = Console(stderr=True)
@@ -112,7 +112,7 @@ class _Reporter:
             text = f"{what}: eta {step.eta:.4f}, best {best:.4f}"
         if self._console.is_terminal:
             self._progress.update(self._task, description=text)
-        elif step.iteration == 1 or step.iteration % 10 == 0:
+        else:
             click.echo(f"gains: {text}", err=True)
 
     def __enter__(self) -> _Reporter:

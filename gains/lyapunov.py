@@ -43,7 +43,8 @@ __all__ = [
     "stability",
 ]
 
-_RELAX = (1e-4, 1e-3, 1e-2)  # relative, of η²: how far from an optimum that is not attained a proof is sought
+# relative, of η²: how far from an optimum that is not attained a proof is sought
+_RELAX = (1e-4, 1e-3, 1e-2, 1e-1, 1.0)
 _EDGE = 1e-9  # a spectral radius within this of 1 is neither below nor above
 
 
@@ -227,6 +228,8 @@ def _stability(question: Question, backend: Backend) -> Analysis:
     solution = solve(*_most_stable(question), backend)
     found = proof(question, solution, eta=None)
     if found.verdict == "undecided" and solution.status is Status.OPTIMAL:
+        if float(solution.values["t"][0, 0]) > _EDGE:
+            return replace(found, reason="the solver found a proof that does not verify")
         return replace(found, reason=infeasible(question))
     return found
 

@@ -11,6 +11,7 @@ import difflib
 import os
 import re
 import tempfile
+from collections.abc import Mapping
 from importlib import resources
 from pathlib import Path
 from typing import Literal, NamedTuple
@@ -18,7 +19,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 import tomli_w
 
-from gains.certificate import gains_hash, model_hash
+from gains.certificate import claim_hash, gains_hash, model_hash
 from gains.model import (
     Actuator,
     Condition,
@@ -171,7 +172,7 @@ def parse_gains(table: Table) -> Gains:
         raise table.error("K2", f"none, as model {model.name} has no [reference]", "one")
     certificate = table.mapping("certificate", None)
     if certificate is not None:
-        _check_hashes(Table(certificate, table.source, "certificate"), model, K1, K2)
+        _check_hashes(certificate, table.source, model, K1, K2)
     table.finish()
     return Gains(name, model, d_min, d_max, K1, K2, certificate)
 
@@ -229,13 +230,17 @@ def _model_path(table: Table) -> Path:
         raise InputError(str(error) if str(error).startswith(prefix) else f"{prefix}model: {error}") from None
 
 
-def _check_hashes(table: Table, model: Model, K1: Matrix, K2: Matrix | None) -> None:
-    """Refuse a certificate that was made for another model or other gains."""
-    hashes = table.table("sha256")
-    for key, actual in (("model", model_hash(model)), ("gains", gains_hash(K1, K2))):
+def _check_hashes(certificate: Mapping[str, object], source: str, model: Model, K1: Matrix, K2: Matrix | None) -> None:
+    """Refuse a certificate that was made for another model or other gains, or that has been changed."""
+    hashes = Table(certificate, source, "certificate").table("sha256")
+    actual_hashes = {
+        "model": (f"model {model.name}", model_hash(model)),
+        "gains": ("K1 and K2", gains_hash(K1, K2)),
+        "certificate": ("the certificate", claim_hash(certificate)),
+    }
+    for key, (what, actual) in actual_hashes.items():
         expected = hashes.string(key)
         if expected != actual:
-            what = f"model {model.name}" if key == "model" else "K1 and K2"
             raise hashes.error(
                 key, f"the hash of {what}, {actual[:12]}…", f"{expected[:12]}…: made for another, or changed"
             )

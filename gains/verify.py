@@ -13,12 +13,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gains.certificate import Certificate, read_certificate
+from gains.certificate import MAX_DELAY, Certificate, read_certificate
 from gains.model import Gains, Matrix
 
 __all__ = ["Verification", "check", "least_eta", "verified"]
 
 _EPS = float(np.finfo(np.float64).eps)
+_LEAST, _MOST = 1e-100, 1e100  # what a certificate and a model may hold: products stay far from under- and overflow
+_UNDERFLOW = 1e-200  # more than all that underflow can take from an entry between those limits
 _EIGENVALUES = 8  # LAPACK's symmetric eigenvalues err by less than this times N eps times the norm
 
 
@@ -68,8 +70,8 @@ def verified(gains: Gains) -> Verification:
 def check(gains: Gains, certificate: Certificate) -> Verification:
     """Return whether P, Q, R ≻ 0, μ ≥ 0 and the inequality of Lemma 1 holds strictly, robust if delta_max > 0."""
     d_min, d_max, mu, eta = certificate.d_min, certificate.d_max, certificate.mu, certificate.eta
-    if not (0 <= d_min <= d_max and d_max >= 1):
-        return _failed(f"no window of delays: {d_min} to {d_max}")
+    if not (0 <= d_min <= d_max and 1 <= d_max <= MAX_DELAY):
+        return _failed(f"no window of delays: {d_min} to {min(d_max, MAX_DELAY + 1)}")
     weights = [certificate.P, certificate.Q, certificate.R]
     numbers = [*weights, np.array([mu, certificate.delta_max, 0.0 if eta is None else eta])]
     if not all(np.isfinite(X).all() for X in numbers):
@@ -83,6 +85,15 @@ def check(gains: Gains, certificate: Certificate) -> Verification:
         if not np.array_equal(X, X.T):
             return _failed(f"{name} is not symmetric")
         results.append(_definite(X, np.zeros_like(X), f"{name} is not positive definite"))
+    for result in results:
+        if not result.passed:
+            return result
+    scalars = [mu or 1.0, eta or 1.0, certificate.delta_max or 1.0]
+    sizes = np.concatenate([*(np.abs(np.diag(X)) for X in weights), scalars])
+    if sizes.min() < _LEAST or max(sizes.max(), *(np.abs(X).max() for X in weights)) > _MOST:
+        return _failed("a number is too small or too large to be computed with")
+    if max(np.abs(part).max(initial=0.0) for part in _maps(gains, certificate.delta_max, modulus=True)) > _MOST:
+        return _failed("a number of the model or the gains is too large to be computed with")
     with np.errstate(over="ignore", invalid="ignore"):
         matrix, error = _inequality(gains, certificate)
         results.append(_definite(-matrix, error, "the inequality of Lemma 1 does not hold"))
@@ -150,7 +161,7 @@ def _inequality(gains: Gains, certificate: Certificate) -> tuple[Matrix, Matrix]
     if certificate.eta is None:
         keep[2 * n : 2 * n + m] = False
     matrix = (matrix + matrix.T) / 2
-    return matrix[np.ix_(keep, keep)], operations * _EPS * bound[np.ix_(keep, keep)]
+    return matrix[np.ix_(keep, keep)], operations * _EPS * bound[np.ix_(keep, keep)] + _UNDERFLOW
 
 
 def _maps(gains: Gains, delta_max: float, *, modulus: bool = False) -> tuple[Matrix, Matrix, Matrix]:
@@ -190,7 +201,12 @@ def _definite(matrix: Matrix, error: Matrix, reason: str) -> Verification:
         return _failed(reason)
     unit = np.exp2(-np.rint(np.log2(diagonal) / 2))
     scaled = matrix * unit[:, None] * unit[None, :]
-    margin = float(np.linalg.eigvalsh(scaled)[0])
+    if np.diag(scaled).min() < 0.25 or np.diag(scaled).max() > 4.0:
+        return _failed(reason)
+    try:
+        margin = float(np.linalg.eigvalsh(scaled)[0])
+    except np.linalg.LinAlgError:
+        return _failed(f"{reason}: its eigenvalues could not be computed")
     rounding = float(np.max(np.sum(error * unit[:, None] * unit[None, :], axis=1)))
     rounding += _EIGENVALUES * len(diagonal) * _EPS * float(np.linalg.norm(scaled))
     passed = margin > rounding

@@ -93,7 +93,9 @@ def _certificate(gains: Gains) -> str:
         return "none verified"
     eta = gains.certificate.get("eta")
     gain = f", eta {eta:.4g}" if isinstance(eta, float) else ""
-    return f"verified for d = {gains.d_min}..{gains.d_max}{gain}"
+    delta = gains.certificate.get("delta_max")
+    robust = f", every |Delta| <= {delta:g}" if isinstance(delta, float) and delta > 0.0 else ""
+    return f"verified for d = {gains.d_min}..{gains.d_max}{gain}{robust}"
 
 
 def delay_summary(flight: FlightData) -> dict[str, Any]:

@@ -9,7 +9,7 @@ import pytest
 from click.testing import CliRunner
 
 from gains.__main__ import cli
-from gains.certificate import gains_hash, model_hash
+from gains.certificate import claim_hash, gains_hash, model_hash
 from gains.store import load_gains, load_model, resolve
 from gains.verify import verified
 
@@ -76,7 +76,9 @@ def test_show_prints_matrices_with_the_names_of_the_states() -> None:
 def test_a_certificate_is_verified_before_it_is_shown_as_one(tmp_path: Path) -> None:
     path, text = tmp_path / "g.toml", resolve("hirm-paper").read_text()
     gains = load_gains("hirm-paper")
-    hashes = f'sha256 = {{model = "{model_hash(gains.model)}", gains = "{gains_hash(gains.K1, gains.K2)}"}}\n'
+    parts = {"model": model_hash(gains.model), "gains": gains_hash(gains.K1, gains.K2)}
+    parts["certificate"] = claim_hash({"method": "other"})
+    hashes = f"sha256 = {{{', '.join(f'{key} = {json.dumps(value)}' for key, value in parts.items())}}}\n"
     path.write_text(text + f'[certificate]\nmethod = "other"\n{hashes}')
     shown = "present, not verified: method 'other' cannot be verified by this version"
     assert f"certificate: {shown}" in invoke("show", str(path))

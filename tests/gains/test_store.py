@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gains.certificate import gains_hash, model_hash
+from gains.certificate import claim_hash, gains_hash, model_hash
 from gains.model import Gains, Model
 from gains.store import (
     DELAY_LIMIT,
@@ -225,7 +225,8 @@ def test_reference_gains_without_a_reference_are_refused() -> None:
 def test_a_certificate_is_kept_as_it_is() -> None:
     plain = parse_gains(Table(GAINS, "f.toml"))
     hashes = {"model": model_hash(plain.model), "gains": gains_hash(plain.K1, plain.K2)}
-    certificate = {"method": "exact", "anything": [1, {"deep": True}], "sha256": hashes}
+    claim = {"method": "exact", "anything": [1, {"deep": True}]}
+    certificate = claim | {"sha256": hashes | {"certificate": claim_hash(claim)}}
     gains = parse_gains(Table(GAINS | {"certificate": certificate}, "f.toml"))
     assert gains.certificate == certificate
     assert parse_gains(Table(GAINS, "f.toml")).certificate is None

@@ -10,7 +10,7 @@ from gains import lmi, verify
 from gains.certificate import Certificate
 from gains.lmi import Uncertain, Weights, Window
 from gains.lyapunov import eta, stability
-from gains.model import Gains, Matrix, augmented
+from gains.model import Gains, Matrix, Model, Trim, augmented
 from gains.store import load_gains
 from gains.verify import check, verified
 from tests.gains.loops import FEASIBLE, random_gains
@@ -128,7 +128,9 @@ def test_a_smaller_eta_is_not_proved(proofs: dict[str, Certificate]) -> None:
         ({"P": np.eye(6) + np.eye(6, k=1)}, "P is not symmetric"),
         ({"P": np.eye(6)}, "the inequality of Lemma 1 does not hold"),
         ({"R": np.full((6, 6), np.nan)}, "a number is not finite"),
-        ({"P": 1e300 * np.eye(6)}, "the inequality of Lemma 1 does not hold"),
+        ({"P": 1e300 * np.eye(6)}, "a number is too small or too large to be computed with"),
+        ({"eta": 1e200}, "a number is too small or too large to be computed with"),
+        ({"d_max": 10**400}, "no window of delays: 1 to 1000001"),
         ({"d_max": 4}, "the inequality of Lemma 1 does not hold"),
         ({"d_min": 4}, "no window of delays: 4 to 3"),
         ({"delta_max": 0.15}, "the inequality of Lemma 1 does not hold"),
@@ -180,3 +182,18 @@ def test_verified_needs_a_certificate_that_covers_the_window(proofs: dict[str, C
     assert verified(narrow).passed
     other = replace(HIRM, certificate={"method": "exact"})
     assert verified(other).reason == "method 'exact' cannot be verified by this version"
+
+
+def test_matrices_so_small_that_products_vanish_prove_nothing() -> None:
+    """x⁺ = A x with ρ(A) = 2: no proof, although every product of such P, Q, R with A underflows to rest."""
+    n, tiny = 20, 5e-324
+    zeros = np.zeros((n, 1))
+    model = Model(
+        "unstable", 0.03, np.full((n, n), 0.1), zeros, np.zeros((n, 0)), np.eye(n), zeros,
+        tuple(f"x{i}" for i in range(n)), Trim(np.zeros(n), np.zeros(1)),
+    )  # fmt: skip
+    gains = Gains("unstable", model, 1, 1, np.zeros((1, n)))
+    for p, q, r in ((4, 1, 1), (4, 1, 2), (4, 2, 1)):
+        identity = tiny * np.eye(n)
+        claim = Certificate("lyapunov", "any", 1, 1, 0.0, None, p * identity, q * identity, r * identity)
+        assert not check(gains, claim).passed
