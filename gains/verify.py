@@ -69,35 +69,52 @@ def verified(gains: Gains) -> Verification:
 
 def check(gains: Gains, certificate: Certificate) -> Verification:
     """Return whether P, Q, R ≻ 0, μ ≥ 0 and the inequality of Lemma 1 holds strictly, robust if delta_max > 0."""
-    d_min, d_max, mu, eta = certificate.d_min, certificate.d_max, certificate.mu, certificate.eta
-    if not (0 <= d_min <= d_max and 1 <= d_max <= MAX_DELAY):
-        return _failed(f"no window of delays: {d_min} to {min(d_max, MAX_DELAY + 1)}")
     weights = [certificate.P, certificate.Q, certificate.R]
-    numbers = [*weights, np.array([mu, certificate.delta_max, 0.0 if eta is None else eta])]
-    if not all(np.isfinite(X).all() for X in numbers):
-        return _failed("a number is not finite")
-    if mu < 0.0 or (eta is not None and eta <= 0.0) or certificate.delta_max < 0.0:
-        return _failed("mu, eta or delta_max is out of range")
-    if certificate.delta_max > 0.0 and gains.model.uncertainty is None:
-        return _failed("it speaks of an uncertainty that the model does not have")
+    unusable = _unusable(gains, certificate)
+    if unusable:
+        return _failed(unusable)
     results: list[Verification] = []
     for name, X in zip(("P", "Q", "R"), weights, strict=True):
         if not np.array_equal(X, X.T):
             return _failed(f"{name} is not symmetric")
         results.append(_definite(X, np.zeros_like(X), f"{name} is not positive definite"))
-    for result in results:
-        if not result.passed:
-            return result
-    scalars = [mu or 1.0, eta or 1.0, certificate.delta_max or 1.0]
-    sizes = np.concatenate([*(np.abs(np.diag(X)) for X in weights), scalars])
-    if sizes.min() < _LEAST or max(sizes.max(), *(np.abs(X).max() for X in weights)) > _MOST:
-        return _failed("a number is too small or too large to be computed with")
-    if max(np.abs(part).max(initial=0.0) for part in _maps(gains, certificate.delta_max, modulus=True)) > _MOST:
-        return _failed("a number of the model or the gains is too large to be computed with")
+    failed = [result for result in results if not result.passed]
+    if failed:
+        return failed[0]
+    beyond = _beyond_reckoning(gains, certificate)
+    if beyond:
+        return _failed(beyond)
     with np.errstate(over="ignore", invalid="ignore"):
         matrix, error = _inequality(gains, certificate)
         results.append(_definite(-matrix, error, "the inequality of Lemma 1 does not hold"))
     return min(results, key=lambda v: (v.passed, v.margin / v.rounding if v.rounding > 0.0 else -math.inf))
+
+
+def _unusable(gains: Gains, certificate: Certificate) -> str:
+    """Return why a certificate makes no sense; empty if it does."""
+    d_min, d_max, mu, eta = certificate.d_min, certificate.d_max, certificate.mu, certificate.eta
+    if not (0 <= d_min <= d_max and 1 <= d_max <= MAX_DELAY):
+        return f"no window of delays: {d_min} to {min(d_max, MAX_DELAY + 1)}"
+    scalars = np.array([mu, certificate.delta_max, 0.0 if eta is None else eta])
+    if not all(np.isfinite(X).all() for X in (certificate.P, certificate.Q, certificate.R, scalars)):
+        return "a number is not finite"
+    if mu < 0.0 or (eta is not None and eta <= 0.0) or certificate.delta_max < 0.0:
+        return "mu, eta or delta_max is out of range"
+    if certificate.delta_max > 0.0 and gains.model.uncertainty is None:
+        return "it speaks of an uncertainty that the model does not have"
+    return ""
+
+
+def _beyond_reckoning(gains: Gains, certificate: Certificate) -> str:
+    """Return why the rounding of what follows could not be bounded; empty if it can."""
+    weights = [certificate.P, certificate.Q, certificate.R]
+    scalars = [certificate.mu or 1.0, certificate.eta or 1.0, certificate.delta_max or 1.0]
+    sizes = np.concatenate([*(np.abs(np.diag(X)) for X in weights), scalars])
+    if sizes.min() < _LEAST or max(sizes.max(), *(np.abs(X).max() for X in weights)) > _MOST:
+        return "a number is too small or too large to be computed with"
+    if max(np.abs(part).max(initial=0.0) for part in _maps(gains, certificate.delta_max, modulus=True)) > _MOST:
+        return "a number of the model or the gains is too large to be computed with"
+    return ""
 
 
 def least_eta(gains: Gains, certificate: Certificate) -> float:
