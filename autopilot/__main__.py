@@ -16,7 +16,6 @@ from autopilot.reference import parse_profile
 from gains.command import FiniteRange, run, version
 from gains.store import load_gains
 from gains.table import InputError
-from gains.verify import verified
 
 __all__ = ["main"]
 
@@ -84,9 +83,6 @@ def cli(
     hears its one peer and nobody else.
     """
     gains = load_gains(gains_name)
-    proof = verified(gains)
-    if require_certificate and not proof.passed:
-        raise InputError(f"gains {gains.name}: no verified certificate ({proof.reason}), but --require-certificate")
     stations = [ADDRESS.convert(text, None, None) for text in gcs if text != "none"]
     if len(stations) > MAX_GROUND_STATIONS:
         raise InputError(f"--gcs: expected at most {MAX_GROUND_STATIONS} ground stations, found {len(stations)}")
@@ -99,6 +95,9 @@ def cli(
         ground_stations=len(stations),
     )
     node = AutopilotNode(config)
+    proof = node.proof
+    if require_certificate and not proof.passed:
+        raise InputError(f"gains {gains.name}: no verified certificate ({proof.reason}), but --require-certificate")
     openers = [partial(dial, "plant", plant), *(partial(dial, f"gcs{i}", a) for i, a in enumerate(stations))]
     proved = "certificate verified" if proof.passed else "no verified certificate"
     banner = f"autopilot: gains {gains.name} ({proved}), plant {plant[0]}:{plant[1]}"

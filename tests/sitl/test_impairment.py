@@ -12,21 +12,7 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from sitl.impairment import JITTERS, Copy, Fate, Impairment, LinkSpec
-from sitl.linkspec import parse_spec
-
-MS = 1_000_000
-S = 1_000_000_000
-SAMPLES = 20_000
-
-
-def impairment(text: str, seed: int = 1) -> Impairment:
-    return Impairment(parse_spec(text), np.random.default_rng(seed))
-
-
-def flights_ns(text: str, seed: int = 1, samples: int = SAMPLES) -> np.ndarray:
-    """Time in the link of each packet, one a second."""
-    link = impairment(text, seed)
-    return np.array([link.schedule(100, n * S)[0] - n * S for n in range(samples)], dtype=float)
+from tests.sitl.links import MS, SAMPLES, S, flights_ns, impairment
 
 
 def accepts(successes: int, trials: int, probability: float) -> bool:

@@ -10,23 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gains.table import InputError
-from sitl.impairment import JITTERS, GammaJitter, Impairment, LinkSpec, NormalJitter, UniformJitter
+from sitl.impairment import JITTERS, GammaJitter, LinkSpec, NormalJitter, UniformJitter
 from sitl.linkspec import MAX_RATE_BPS, MAX_TIME_NS, PRESETS, format_spec, parse_link, parse_spec
-
-MS = 1_000_000
-S = 1_000_000_000
-SAMPLES = 20_000
-
-
-def impairment(text: str, seed: int = 1) -> Impairment:
-    return Impairment(parse_spec(text), np.random.default_rng(seed))
-
-
-def flights_ns(text: str, seed: int = 1, samples: int = SAMPLES) -> np.ndarray:
-    """Time in the link of each packet, one a second."""
-    link = impairment(text, seed)
-    return np.array([link.schedule(100, n * S)[0] - n * S for n in range(samples)], dtype=float)
-
+from tests.sitl.links import MS, S, flights_ns
 
 # ---------------------------------------------------------------------------------------------- grammar
 
