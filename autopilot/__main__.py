@@ -1,4 +1,4 @@
-"""The ``autopilot`` program: flies one set of gains over MAVLink."""
+"""The ``autopilot`` program: flies gains, or a schedule of them, over MAVLink."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from autopilot.link.process import ADDRESS, ProcessOptions, process_options, run
 from autopilot.link.udp import Address, dial
 from autopilot.reference import parse_profile
 from gains.command import FiniteRange, run, version
-from gains.store import load_gains
+from gains.store import load_law
 from gains.table import InputError
 
 __all__ = ["main"]
@@ -23,7 +23,13 @@ MAX_GROUND_STATIONS = 8
 
 
 @click.command()
-@click.option("--gains", "gains_name", default="hirm-paper", show_default=True, help="Stored gains, or a gain file.")
+@click.option(
+    "--gains",
+    "gains_name",
+    default="hirm-paper",
+    show_default=True,
+    help="Stored gains, or a gain file; a schedule too.",
+)
 @click.option(
     "--plant",
     type=ADDRESS,
@@ -82,7 +88,7 @@ def cli(
     Runs until Ctrl-C. Telemetry goes to the ground stations, the control link to the plant; each port
     hears its one peer and nobody else.
     """
-    gains = load_gains(gains_name)
+    gains = load_law(gains_name)
     stations = [ADDRESS.convert(text, None, None) for text in gcs if text != "none"]
     if len(stations) > MAX_GROUND_STATIONS:
         raise InputError(f"--gcs: expected at most {MAX_GROUND_STATIONS} ground stations, found {len(stations)}")
@@ -100,7 +106,9 @@ def cli(
         raise InputError(f"gains {gains.name}: no verified certificate ({proof.reason}), but --require-certificate")
     openers = [partial(dial, "plant", plant), *(partial(dial, f"gcs{i}", a) for i, a in enumerate(stations))]
     proved = "certificate verified" if proof.passed else "no verified certificate"
-    banner = f"autopilot: gains {gains.name} ({proved}), plant {plant[0]}:{plant[1]}"
+    windows = ", ".join(f"{d_min}..{d_max}" for d_min, d_max in node.windows)
+    scheduled = f", delay {windows}" if len(node.windows) > 1 else ""
+    banner = f"autopilot: gains {gains.name} ({proved}){scheduled}, plant {plant[0]}:{plant[1]}"
     metadata = {"program": "autopilot", "gains": gains.name, "version": version()}
     run_node("autopilot", node, openers, ProcessOptions(clock, record, stream), metadata, tap=True, banner=banner)
 

@@ -6,13 +6,14 @@ forecast, and only then the first heartbeat goes to the plant, whose clockwork s
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
 
 from autopilot.clocksync import ClockSync
-from autopilot.control import law_of
+from autopilot.control import SetChanges, choose_set, law_of
 from autopilot.delay import UNKNOWN, DelayEstimate, DelayEstimator
 from autopilot.failsafe import Event, FailsafeState, Limits, Mode, step
 from autopilot.link.clock import NS_PER_MS, NS_PER_S, NS_PER_US, following
@@ -27,7 +28,6 @@ from autopilot.link.wire import (
     NamedValueInt,
     ServoOutputRaw,
     Severity,
-    StatusText,
     Timesync,
     VfrHud,
     Wire,
@@ -35,8 +35,8 @@ from autopilot.link.wire import (
 )
 from autopilot.reference import Profile, ReferenceModel, match_reference
 from autopilot.state import JUMP_BACK_NS, Drop, Sample, SampleAssembler
-from autopilot.vehicle import Vehicle
-from gains.model import Gains
+from autopilot.vehicle import Vehicle, banner
+from gains.model import GainLaw, sets_of
 from gains.verify import verified
 
 __all__ = ["AutopilotConfig", "AutopilotNode"]
@@ -58,8 +58,8 @@ class AutopilotConfig:
 
     Attributes
     ----------
-    gains : Gains
-        K1, K2, the window and the model.
+    gains : Gains or Schedule
+        K1 and K2 with their windows, and the model.
     profile : Profile
         The programmed reference.
     actuator : "pwm" or "float"
@@ -72,7 +72,7 @@ class AutopilotConfig:
         Number of ports gcs0, gcs1, ...
     """
 
-    gains: Gains
+    gains: GainLaw
     profile: Profile = field(default_factory=Profile)
     actuator: Literal["pwm", "float"] = "pwm"
     failsafe: Literal["on", "monitor"] = "on"
@@ -91,6 +91,7 @@ class _Command:
     u: float
     saturated: bool
     mode: Mode
+    gain_set: int
 
 
 class AutopilotNode:
@@ -110,15 +111,21 @@ class AutopilotNode:
         self.clock = ClockSync()
         self.delay = DelayEstimator(self.model.Ts_ns)
         self.samples = SampleAssembler(self.model)
-        self.law = law_of(config.gains)
-        self.travel = self.law.travel
+        self.sets = sets_of(config.gains)
+        self.windows = [(gains.d_min, gains.d_max) for gains in self.sets]
+        self.laws = [law_of(gains) for gains in self.sets]
+        self.gain_set = 0
+        self.gain_set_changes = SetChanges()
+        self.travel = self.laws[0].travel
         self.reference = self._new_reference()
         self.limits = Limits(config.hold_ns)
         # d_max samples, and a little for clocks that differ
         self._stale_ns = config.gains.d_max * self.model.Ts_ns + self.model.Ts_ns // 4
         self.failsafe = FailsafeState()
         self.epoch = 0
-        self.vehicle = Vehicle(tuple(f"gcs{i}" for i in range(config.ground_stations)), self._banner())
+        self.vehicle = Vehicle(
+            tuple(f"gcs{i}" for i in range(config.ground_stations)), banner(config.gains, self.proof)
+        )
         self._u = self.travel.neutral
         self._last: Sample | None = None
         self._fresh_ns: int | None = None
@@ -273,6 +280,7 @@ class AutopilotNode:
             self._first_j = sample.j
         reason = "delay unknown" if forecast.d is None else f"delay {forecast.d}"
         self._failsafe_step(Event.GOOD if inside else Event.OUTSIDE, reason, now_ns)
+        self.gain_set = choose_set(self.windows, self.gain_set, forecast.d)
         ahead = min(forecast.d, MAX_AHEAD) if forecast.d is not None else gains.d_min
         if self.reference is not None:
             self.reference.advance(sample.j)
@@ -281,16 +289,18 @@ class AutopilotNode:
         xr = self.reference.ahead(ahead) if self.reference is not None else ()
         saturated = False
         if self.failsafe.mode is Mode.TRACKING or self.config.failsafe == "monitor":
-            self._u, saturated = self.law.command(sample.x, xr)
+            self._u, saturated = self.laws[self.gain_set].command(sample.x, xr)
         elif self.failsafe.mode is not Mode.HOLD:
             self._u = self.travel.neutral
         self._next_repeat_ns = now_ns + self.model.Ts_ns
         self._send_command(sample)
-        self._untold.append(_Command(now_ns, sample, forecast, xr, self._u, saturated, self.failsafe.mode))
+        self._untold.append(
+            _Command(now_ns, sample, forecast, xr, self._u, saturated, self.failsafe.mode, self.gain_set)
+        )
 
     def _match_reference(self, sample: Sample, ahead: int) -> None:
         """Let the reference go on from where the aircraft is: re-entry without a jump of the elevator."""
-        gains = self.config.gains
+        gains = self.sets[self.gain_set]
         if self.reference is None or gains.K2 is None or self.config.failsafe == "monitor":
             return
         dx = np.array(sample.x) - self.model.trim.x
@@ -310,6 +320,20 @@ class AutopilotNode:
             self.vehicle.show(part, command.at_ns)
         self.vehicle.show(ServoOutputRaw(0, self.travel.to_pwm(command.u)), command.at_ns)
         self._record_command(command)
+        if command.mode is Mode.TRACKING:
+            self._tell_gain_set(command)
+
+    def _tell_gain_set(self, command: _Command) -> None:
+        """Say which set of gains flies now when it has changed; not more often than people can follow."""
+        changes = self.gain_set_changes.flown(command.gain_set, command.at_ns)
+        if not changes:
+            return
+        d_min, d_max = self.windows[command.gain_set]
+        more = f", {changes} changes" if changes > 1 else ""
+        text = f"gain set {command.gain_set}: delay {d_min} to {d_max}{more}"
+        self.vehicle.say(Severity.INFO, text)
+        data = {"gain_set": command.gain_set, "d": command.forecast.d, "changes": changes}
+        self._event("gain_set", text, command.at_ns, data)
 
     def _new_reference(self) -> ReferenceModel | None:
         if self.model.reference is None:
@@ -383,20 +407,14 @@ class AutopilotNode:
     def _send(self, message: Message) -> None:
         self._out.append((PLANT_PORT, self.wire.encode(message)))
 
-    def _banner(self) -> list[StatusText]:
-        """Return what a ground station must know at start: whether what it flies is proved."""
-        if self.proof.passed:
-            return [StatusText(Severity.INFO, f"certificate verified: gains {self.config.gains.name}")]
-        return [StatusText(Severity.WARNING, f"no verified certificate: gains {self.config.gains.name}")]
-
     def _announce_gains(self, now_ns: int) -> None:
         gains, proof = self.config.gains, self.proof
-        data = {"gains": gains.name, "d_min": gains.d_min, "d_max": gains.d_max}
+        data = {"gains": gains.name, "d_min": gains.d_min, "d_max": gains.d_max, "windows": self.windows}
         self._event(
             "gains", self.vehicle.banner[0].text, now_ns, data | {"verified": proof.passed, "reason": proof.reason}
         )
 
-    def _event(self, kind: str, text: str, now_ns: int, data: dict[str, object] | None = None) -> None:
+    def _event(self, kind: str, text: str, now_ns: int, data: Mapping[str, object] | None = None) -> None:
         body = {"kind": kind, "node": "autopilot", "text": text, "data": data or {}}
         self._records.append(Record("events", now_ns, body))
 
@@ -416,6 +434,7 @@ class AutopilotNode:
             "d_high": forecast.high,
             "status": forecast.status,
             "mode": command.mode,
+            "gain_set": command.gain_set,
         }
         self._records.append(Record("autopilot/command", command.at_ns, body))
 
@@ -427,6 +446,7 @@ class AutopilotNode:
             "timesync_unmatched": self.clock.unmatched,
             "ground": {port: {k.value: n for k, n in w.rejects.items()} for port, w in self.vehicle.wires.items()},
             "telemetry_refused": self.vehicle.refused,
+            "gain_set_changes": self.gain_set_changes.total,
             "clock": clock.status,
             "clock_bound_ns": clock.bound_ns,
         }

@@ -17,18 +17,23 @@ from autopilot.link.wire import (
     Message,
     NamedValueInt,
     ServoOutputRaw,
+    Severity,
     StatusText,
     Wire,
     autopilot_heartbeat,
 )
+from gains.model import GainLaw, Schedule
+from gains.verify import Verification
 
-__all__ = ["Vehicle"]
+__all__ = ["Vehicle", "banner"]
 
 HEARTBEAT_NS = NS_PER_S
 MAX_WAITING = 256
 """Messages that may wait for the next tick; further ones are refused and counted."""
 MAX_TEXTS = 32
 """Texts that may wait when nothing else may."""
+MAX_TEXT = 50
+"""Characters that one STATUSTEXT holds."""
 MAX_BANNER = 8
 """Start-up messages that a ground station is told when it first speaks."""
 
@@ -114,3 +119,18 @@ class Vehicle:
         """Take away what is to be sent."""
         out, self._out = self._out, []
         return out
+
+
+def banner(gains: GainLaw, proof: Verification) -> list[StatusText]:
+    """Return what a ground station must know at start: whether what flies is proved, and the windows of a schedule."""
+    what = f"{'schedule' if isinstance(gains, Schedule) else 'gains'} {gains.name}"
+    if proof.passed:
+        texts = [StatusText(Severity.INFO, f"certificate verified: {what}")]
+    else:
+        texts = [StatusText(Severity.WARNING, f"no verified certificate: {what}")]
+    if isinstance(gains, Schedule):
+        windows = ", ".join(f"{each.d_min}..{each.d_max}" for each in gains.sets)
+        text = f"{len(gains.sets)} gain sets: delay {windows}"
+        overall = f"{len(gains.sets)} gain sets: delay {gains.d_min} to {gains.d_max}"
+        texts.append(StatusText(Severity.INFO, text if len(text) <= MAX_TEXT else overall))
+    return texts

@@ -1,4 +1,4 @@
-"""The ``gains`` command: models and gains listed and shown; :mod:`gains.proving` has the other commands."""
+"""The ``gains`` command: models, gains and schedules listed and shown; :mod:`gains.proving` has the other commands."""
 
 from __future__ import annotations
 
@@ -12,12 +12,14 @@ from rich.console import Console
 from rich.table import Table as Grid
 
 from gains.command import print_json, run, version
-from gains.model import Gains, Matrix, Model
-from gains.proving import JSON_OPTION, bound, certify, design
-from gains.store import load, load_gains, load_model, stored
+from gains.model import GainLaw, Gains, Matrix, Model, Schedule, sets_of
+from gains.proving import JSON_OPTION, bound, certify, design, schedule, witness
+from gains.store import load, load_law, load_model, stored
 from gains.verify import verified
 
 __all__ = ["cli", "main"]
+
+_SET = ("d_min", "d_max", "K1", "K2")
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"]})
@@ -42,7 +44,7 @@ def list_(as_json: bool) -> None:
         return
     grid = _grid("name", "kind", "what")
     for name, kind, path in entries:
-        what = _model_line(load_model(path)) if kind == "model" else _gains_line(load_gains(path))
+        what = _model_line(load_model(path)) if kind == "model" else _law_line(load_law(path))
         grid.add_row(name, kind, what)
     _console().print(grid)
 
@@ -51,20 +53,20 @@ def list_(as_json: bool) -> None:
 @click.argument("name")
 @JSON_OPTION
 def show(name: str, as_json: bool) -> None:
-    """Show the model or the gains NAME.
+    """Show the model, the gains or the schedule NAME.
 
     A model is shown discrete at its sampling period, whatever the file holds.
     """
     item = load(name)
     if as_json:
-        print_json(_model_json(item) if isinstance(item, Model) else _gains_json(item))
+        print_json(_model_json(item) if isinstance(item, Model) else _law_json(item))
     elif isinstance(item, Model):
         _show_model(_console(), item)
     else:
-        _show_gains(_console(), item)
+        _show_law(_console(), item)
 
 
-for command in (certify, bound, design):
+for command in (certify, bound, witness, schedule, design):
     cli.add_command(command)
 
 
@@ -96,17 +98,17 @@ def _model_json(model: Model) -> dict[str, object]:
     }
 
 
-def _gains_json(gains: Gains) -> dict[str, object]:
+def _law_json(law: GainLaw) -> dict[str, object]:
+    scheduled = isinstance(law, Schedule)
     return {
-        "kind": "gains",
-        "name": gains.name,
-        "model": gains.model.name,
-        "Ts": gains.model.Ts,
-        "d_min": gains.d_min,
-        "d_max": gains.d_max,
-        "K1": gains.K1,
-        "K2": gains.K2,
-        "certificate": _certificate(gains),
+        "kind": "schedule" if scheduled else "gains",
+        "name": law.name,
+        "model": law.model.name,
+        "Ts": law.model.Ts,
+        "d_min": law.d_min,
+        "d_max": law.d_max,
+        **({"window": [_fields(gains, *_SET) for gains in sets_of(law)]} if scheduled else _fields(law, "K1", "K2")),
+        "certificate": _certificate(law),
     }
 
 
@@ -174,13 +176,37 @@ def _show_rest(console: Console, model: Model) -> None:
         )
 
 
+def _show_law(console: Console, law: GainLaw) -> None:
+    console.print(f"{law.name}: {_law_line(law)}")
+    if isinstance(law, Schedule):
+        _show_windows(console, law)
+    else:
+        _show_gains(console, law)
+    console.print(f"certificate: {_certificate(law)}", soft_wrap=True)
+
+
 def _show_gains(console: Console, gains: Gains) -> None:
-    console.print(f"{gains.name}: {_gains_line(gains)}")
     inputs = _labels("u", gains.model.nu)
     console.print(_matrix("K1", gains.K1, inputs, gains.model.states))
     if gains.K2 is not None:
         console.print(_matrix("K2", gains.K2, inputs, _labels("xr", gains.model.nr)))
-    console.print(f"certificate: {_certificate(gains)}", soft_wrap=True)
+
+
+def _show_windows(console: Console, schedule: Schedule) -> None:
+    """Show the sets of a schedule side by side, K1 above K2, one column for each input."""
+    model = schedule.model
+    rows = [*(f"K1 {state}" for state in model.states), *(f"K2 {xr}" for xr in _labels("xr", model.nr))]
+    inputs = _labels("u", model.nu)
+    windows = [
+        _matrix(f"set {index}: delay {gains.d_min} to {gains.d_max}", _stacked(gains), rows, inputs)
+        for index, gains in enumerate(schedule.sets)
+    ]
+    console.print(Columns(windows, padding=0))
+
+
+def _stacked(gains: Gains) -> Matrix:
+    """Return K1 over K2, transposed; shape (nx + nr, nu)."""
+    return gains.K1.T if gains.K2 is None else np.vstack([gains.K1.T, gains.K2.T])
 
 
 def _model_line(model: Model) -> str:
@@ -190,13 +216,14 @@ def _model_line(model: Model) -> str:
     return ", ".join(parts)
 
 
-def _gains_line(gains: Gains) -> str:
-    low, high = (d * gains.model.Ts * 1e3 for d in (gains.d_min, gains.d_max))
-    window = f"delay {gains.d_min} to {gains.d_max} samples ({low:g} to {high:g} ms)"
-    return f"for {gains.model.name}, {window}"
+def _law_line(law: GainLaw) -> str:
+    low, high = (d * law.model.Ts * 1e3 for d in (law.d_min, law.d_max))
+    window = f"delay {law.d_min} to {law.d_max} samples ({low:g} to {high:g} ms)"
+    sets = f", schedule of {_count(len(law.sets), 'set')}" if isinstance(law, Schedule) else ""
+    return f"for {law.model.name}, {window}{sets}"
 
 
-def _certificate(gains: Gains) -> str:
+def _certificate(gains: GainLaw) -> str:
     if gains.certificate is None:
         return "none"
     verification = verified(gains)

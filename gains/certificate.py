@@ -16,10 +16,19 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gains.model import Gains, Matrix, Model, read_only
+from gains.model import GainLaw, Matrix, Model, Schedule, read_only
 from gains.table import Table
 
-__all__ = ["MAX_DELAY", "METHODS", "Certificate", "claim_hash", "gains_hash", "model_hash", "read_certificate"]
+__all__ = [
+    "MAX_DELAY",
+    "METHODS",
+    "Certificate",
+    "claim_hash",
+    "gains_hash",
+    "law_hash",
+    "model_hash",
+    "read_certificate",
+]
 
 METHODS = ("lyapunov", "printed")  # proofs by P, Q, R; other methods leave other matrices
 _QUANTUM = 1e-10
@@ -65,12 +74,12 @@ class Certificate:
         for name in ("P", "Q", "R"):
             object.__setattr__(self, name, read_only(getattr(self, name)))
 
-    def table(self, gains: Gains, margin: float, versions: Mapping[str, str]) -> dict[str, object]:
+    def table(self, gains: GainLaw, margin: float, versions: Mapping[str, str]) -> dict[str, object]:
         """Return the [certificate] table of a gain file; every float at full double precision.
 
         Parameters
         ----------
-        gains : Gains
+        gains : Gains or Schedule
             What it certifies.
         margin : float
             As verification found it; for the reader.
@@ -91,13 +100,13 @@ class Certificate:
         }
         hashes = {
             "model": model_hash(gains.model),
-            "gains": gains_hash(gains.K1, gains.K2),
+            "gains": law_hash(gains),
             "certificate": claim_hash(claim),
         }
         return {**claim, "sha256": hashes, "versions": dict(versions)}
 
 
-def read_certificate(gains: Gains, source: str = "certificate") -> Certificate | None:
+def read_certificate(gains: GainLaw, source: str = "certificate") -> Certificate | None:
     """Return the certificate of a gain file; None if it has none or one of a method unknown here.
 
     Raises
@@ -146,6 +155,14 @@ def gains_hash(K1: Matrix, K2: Matrix | None) -> str:
         if K is not None:
             digest.update(f"{name} {K.shape} {(K + 0.0).tolist()}\n".encode())  # + 0.0: no negative zeros
     return digest.hexdigest()
+
+
+def law_hash(law: GainLaw) -> str:
+    """Return the SHA-256 of a set of gains, or of a schedule's windows and gains in their order, in hexadecimal."""
+    if not isinstance(law, Schedule):
+        return gains_hash(law.K1, law.K2)
+    windows = (f"{gains.d_min} {gains.d_max} {gains_hash(gains.K1, gains.K2)}\n" for gains in law.sets)
+    return hashlib.sha256("".join(windows).encode()).hexdigest()
 
 
 def claim_hash(certificate: Mapping[str, object]) -> str:

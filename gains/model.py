@@ -11,6 +11,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
+from itertools import pairwise
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -20,14 +22,17 @@ __all__ = [
     "Actuator",
     "Augmented",
     "Condition",
+    "GainLaw",
     "Gains",
     "Matrix",
     "Model",
     "Reference",
+    "Schedule",
     "Trim",
     "Uncertainty",
     "augmented",
     "read_only",
+    "sets_of",
     "spectral_radius",
     "zero_order_hold",
 ]
@@ -262,6 +267,52 @@ class Gains:
         assert self.K1.shape == (self.model.nu, self.model.nx)
         assert (self.K2 is None) == (self.model.reference is None)
         assert self.K2 is None or self.K2.shape == (self.model.nu, self.model.nr)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Schedule:
+    """Sets of gains for one model, each with its own window of delays; the delay of a command chooses its set.
+
+    Attributes
+    ----------
+    name : str
+    model : Model
+    sets : tuple of Gains
+        At least one, without certificates. d_min and d_max rise from each to the next, so that no window lies in
+        another, and no delay between the first d_min and the last d_max is left out.
+    certificate : Mapping[str, object] or None
+        The file's table as it is, over all switching between the sets: nothing here has been verified.
+    """
+
+    name: str
+    model: Model
+    sets: tuple[Gains, ...]
+    certificate: Mapping[str, object] | None = None
+
+    def __post_init__(self) -> None:
+        assert self.sets
+        assert all(gains.model is self.model and gains.certificate is None for gains in self.sets)
+        for before, after in pairwise(self.sets):
+            assert before.d_min < after.d_min <= before.d_max + 1 <= after.d_max
+
+    @property
+    def d_min(self) -> int:
+        """The least delay of any window, samples."""
+        return self.sets[0].d_min
+
+    @property
+    def d_max(self) -> int:
+        """The largest delay of any window, samples."""
+        return self.sets[-1].d_max
+
+
+GainLaw: TypeAlias = Gains | Schedule
+"""What a gain file holds: one set of gains, or several for windows of delays."""
+
+
+def sets_of(law: GainLaw) -> tuple[Gains, ...]:
+    """Return the sets of gains of a law; plain gains are the one set."""
+    return law.sets if isinstance(law, Schedule) else (law,)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -1,4 +1,4 @@
-"""The commands that prove and design: ``gains certify``, ``gains bound``, ``gains design``.
+"""The commands that prove and design: ``gains certify``, ``gains bound``, ``gains design``; dispatch by method.
 
 What needs a solver is imported by the command that does, so that listing and showing stay quick.
 """
@@ -15,14 +15,17 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from gains.command import NEGATIVE, SUCCESS, FiniteRange, print_json, version
-from gains.model import Gains
-from gains.store import DELAY_LIMIT, load_gains, model_path, save_gains
+from gains.model import GainLaw, Gains, Schedule
+from gains.store import DELAY_LIMIT, load_gains, load_law, model_path, save_gains
 from gains.table import InputError
 
 if TYPE_CHECKING:
+    from gains.decide import Decision
+    from gains.exact import ExactAnalysis
     from gains.lyapunov import Analysis
+    from gains.switched import Transitions
 
-__all__ = ["JSON_OPTION", "bound", "certify", "design", "parse_window", "write_certified"]
+__all__ = ["JSON_OPTION", "bound", "certify", "design", "parse_window", "schedule", "witness", "write_certified"]
 
 JSON_OPTION = click.option("--json", "as_json", is_flag=True, help="Print one JSON object on standard output.")
 TRANSITIONS_OPTION = click.option(
@@ -34,27 +37,61 @@ _clock = time.perf_counter  # noqa: TID251  # a command says how long it took
 @click.command()
 @click.argument("name", metavar="GAINS")
 @click.option("--delay", "delay", metavar="MIN:MAX", help="Window of delays in samples; default: the file's.")
-@click.option("--method", type=click.Choice(["lyapunov", "printed"]), default="lyapunov", show_default=True)
+@click.option("--method", type=click.Choice(["exact", "lyapunov", "printed"]), default="exact", show_default=True)
 @TRANSITIONS_OPTION
 @click.option("--delta", type=FiniteRange(min=0.0), default=0.0, help="Bound on the uncertainty; default 0: none.")
+@click.option("--memory", type=click.IntRange(0, 2), default=0, show_default=True, help="Past delays a storage knows.")
+@click.option("--flown/--no-flown", default=True, show_default=True, help="Certify the law as it runs too.")
 @click.option("-o", "--output", type=click.Path(path_type=Path), help="Write the gains with their certificate.")
 @JSON_OPTION
 def certify(
-    name: str, delay: str | None, method: str, transitions: str, delta: float, output: Path | None, as_json: bool
+    name: str,
+    delay: str | None,
+    method: str,
+    transitions: Transitions,
+    delta: float,
+    memory: int,
+    flown: bool,
+    output: Path | None,
+    as_json: bool,
 ) -> int:
     """Prove that GAINS are stable for every delay in a window, and bound the gain eta from v to e.
 
-    'lyapunov' is Lemma 1; 'printed' is Lemma 2 and Theorem 1 as the paper prints them. A proof for transitions
-    'any' holds for 'fifo' too. The conditions are sufficient: without a proof the answer is 'undecided'.
+    'exact' decides on the lifted form: a proof and eta with a delay sequence that comes near it, or a delay sequence
+    that breaks the loop; --memory tightens eta. 'lyapunov' is Lemma 1, 'printed' is Lemma 2 and Theorem 1 as the
+    paper prints them: sufficient, without a proof the answer is 'undecided'. A proof for transitions 'any' holds for
+    'fifo' too.
     """
-    from gains import lyapunov, printed  # with the solver: listing and showing do without
+    law = load_law(name)
+    d_min, d_max = (law.d_min, law.d_max) if delay is None else parse_window(delay)
+    if delta > 0.0 and law.model.uncertainty is None:
+        raise InputError(f"--delta: expected 0, as model {law.model.name} has no [uncertainty], found {delta:g}")
+    if method == "exact":
+        from gains.deciding import Question, run_certify  # with the solver: listing and showing do without
 
+        question = Question(law, d_min, d_max, transitions, delta, memory)
+        return run_certify(question, name, output, as_json=as_json, flown=flown)
     gains = load_gains(name)
-    d_min, d_max = (gains.d_min, gains.d_max) if delay is None else parse_window(delay)
     if d_max < 1:
         raise InputError("--delay: expected a window up to at least 1 sample, found 0:0")
-    if delta > 0.0 and gains.model.uncertainty is None:
-        raise InputError(f"--delta: expected 0, as model {gains.model.name} has no [uncertainty], found {delta:g}")
+    return _certify_sufficient(gains, name, (d_min, d_max), method, transitions, delta, output, as_json=as_json)
+
+
+def _certify_sufficient(
+    gains: Gains,
+    name: str,
+    window: tuple[int, int],
+    method: str,
+    transitions: str,
+    delta: float,
+    output: Path | None,
+    *,
+    as_json: bool,
+) -> int:
+    """Certify by a sufficient condition, print the answer, write the gains, and return the exit code."""
+    from gains import lyapunov, printed
+
+    d_min, d_max = window
     start = _clock()
     prove = printed.eta if method == "printed" else lyapunov.eta
     click.echo(f"gains: certifying {gains.name}, delay {d_min} to {d_max}, method {method}", err=True)
@@ -88,19 +125,29 @@ def certify(
 @click.argument("name", metavar="GAINS")
 @click.option("--d-min", type=click.IntRange(0, DELAY_LIMIT), default=1, show_default=True)
 @click.option("--limit", type=click.IntRange(1, DELAY_LIMIT), default=20, show_default=True)
-@click.option("--method", type=click.Choice(["lyapunov", "constant"]), default="lyapunov", show_default=True)
+@click.option("--method", type=click.Choice(["exact", "lyapunov", "constant"]), default="exact", show_default=True)
 @TRANSITIONS_OPTION
 @JSON_OPTION
-def bound(name: str, d_min: int, limit: int, method: str, transitions: str, as_json: bool) -> int:
+def bound(name: str, d_min: int, limit: int, method: str, transitions: Transitions, as_json: bool) -> int:
     """Find the largest d_max up to a limit for which GAINS are proved stable on [d_min, d_max].
 
-    'lyapunov' is Lemma 1, for delays that vary as they like; 'constant' is exact for delays that never change.
+    'exact' gives a proof at d_max and a delay sequence that breaks d_max + 1. 'lyapunov' is Lemma 1, a sufficient
+    condition; 'constant' is exact for delays that never change.
     """
-    from gains import lyapunov
-
-    gains = load_gains(name)
+    law = load_law(name)
     if limit < d_min:
         raise InputError(f"--limit: expected at least d_min ({d_min}), found {limit}")
+    if method == "exact":
+        from gains.deciding import run_bound
+
+        return run_bound(law, d_min, limit, transitions, as_json=as_json)
+    return _bound_sufficient(load_gains(name), d_min, limit, method, transitions, as_json=as_json)
+
+
+def _bound_sufficient(gains: Gains, d_min: int, limit: int, method: str, transitions: str, *, as_json: bool) -> int:
+    """Find the largest d_max by Lemma 1, or for constant delays; print the answer and return the exit code."""
+    from gains import lyapunov
+
     start = _clock()
     click.echo(f"gains: bounding the delay of {gains.name} from {d_min} up to {limit}, method {method}", err=True)
     search = lyapunov.largest_constant_d if method == "constant" else lyapunov.largest_d_max
@@ -130,6 +177,40 @@ def bound(name: str, d_min: int, limit: int, method: str, transitions: str, as_j
         )
         click.echo(f"{gains.name}: {kind} proved stable {proved}{more}")
     return NEGATIVE if found.d_max is None else SUCCESS
+
+
+@click.command()
+@click.argument("name", metavar="GAINS")
+@click.option("--delay", required=True, metavar="MIN:MAX", help="Window of delays in samples.")
+@TRANSITIONS_OPTION
+@click.option("-o", "--output", type=click.Path(dir_okay=False, path_type=Path), required=True, help="The CSV file.")
+@JSON_OPTION
+def witness(name: str, delay: str, transitions: Transitions, output: Path, as_json: bool) -> int:
+    """Find a periodic delay sequence in a window under which GAINS diverge, and write it as CSV.
+
+    The sequence of largest growth found is written; its growth is confirmed in multiple precision. 'sitl relay
+    --witness' and the scenarios 'witness' fly it.
+    """
+    gains, window = load_gains(name), parse_window(delay)
+    from gains.deciding import run_witness
+
+    return run_witness(gains, window, transitions, output, as_json=as_json)
+
+
+@click.command()
+@click.argument("names", metavar="GAINS...", nargs=-1, required=True)
+@click.option("-o", "--output", type=click.Path(dir_okay=False, path_type=Path), required=True, help="The gain file.")
+@TRANSITIONS_OPTION
+@click.option("--delta", type=FiniteRange(min=0.0), default=0.0, help="Bound on the uncertainty; default 0: none.")
+@JSON_OPTION
+def schedule(names: tuple[str, ...], output: Path, transitions: Transitions, delta: float, as_json: bool) -> int:
+    """Join GAINS, each with the window of its file, into one schedule, and certify it under every switching.
+
+    The set of a command may be any whose window, widened by one sample for a wrong estimate, contains its delay.
+    """
+    from gains.deciding import run_schedule
+
+    return run_schedule(names, output, transitions, delta, as_json=as_json)
 
 
 @click.command()
@@ -192,10 +273,10 @@ def parse_window(text: str) -> tuple[int, int]:
     return d_min, d_max
 
 
-def write_certified(output: Path, model: str | Path, gains: Gains, found: Analysis) -> bool:
+def write_certified(output: Path, model: str | Path, law: GainLaw, found: Analysis | ExactAnalysis | Decision) -> bool:
     """Write gains with the certificate that was found for them; return whether there was one.
 
-    The window of the file is the certificate's.
+    The window of the file is the certificate's; a schedule keeps its own.
 
     Raises
     ------
@@ -205,10 +286,14 @@ def write_certified(output: Path, model: str | Path, gains: Gains, found: Analys
     if found.certificate is None or found.verification is None or found.verdict != "stable":
         return False
     versions = {part: metadata.version(part) for part in ("clarabel", "numpy")} | {"lagproof": version()}
-    certificate = found.certificate.table(gains, found.verification.margin, versions)
-    d_min, d_max = found.certificate.d_min, found.certificate.d_max
+    certificate = found.certificate.table(law, found.verification.margin, versions)
+    if isinstance(law, Schedule):
+        proved: GainLaw = replace(law, certificate=certificate)
+    else:
+        d_min, d_max = found.certificate.d_min, found.certificate.d_max
+        proved = replace(law, d_min=d_min, d_max=d_max, certificate=certificate)
     try:
-        save_gains(output, replace(gains, d_min=d_min, d_max=d_max, certificate=certificate), model)
+        save_gains(output, proved, model)
     except OSError as error:
         raise InputError(f"{output}: {error.strerror or error}") from None
     return True

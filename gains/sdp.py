@@ -28,7 +28,20 @@ from scipy import sparse
 from gains.lmi import Block, Blocks
 from gains.model import Matrix
 
-__all__ = ["Affine", "Backend", "Program", "Solution", "Statement", "Status", "Variable", "solve"]
+__all__ = [
+    "Affine",
+    "Backend",
+    "Cones",
+    "Program",
+    "Raw",
+    "Solution",
+    "Statement",
+    "Status",
+    "Variable",
+    "packing",
+    "solve",
+    "solve_cones",
+]
 
 Backend = Literal["clarabel", "cvxpy"]
 _SQRT2 = math.sqrt(2.0)
@@ -207,6 +220,74 @@ class Assembled(NamedTuple):
     negative: list[tuple[slice, int]]
 
 
+class Cones(NamedTuple):
+    """Minimise q'x subject to b − A x ∈ a product of cones of semidefinite matrices, assembled by the caller.
+
+    Attributes
+    ----------
+    q : ndarray, shape (variables,)
+    A : sparse matrix, shape (rows, variables)
+    b : ndarray, shape (rows,)
+    sizes : sequence of int
+        Sizes of the matrices, in the order of their rows, each in the packed form of :func:`packing`.
+    """
+
+    q: NDArray[np.float64]
+    A: sparse.csc_matrix
+    b: NDArray[np.float64]
+    sizes: Sequence[int]
+
+
+class Raw(NamedTuple):
+    """What the solver returned for :class:`Cones`.
+
+    Attributes
+    ----------
+    status : Status
+    x : ndarray
+    duals : list of ndarray
+        One Z ⪰ 0 for each cone.
+    accuracy : float
+        The larger of the residuals and of the gap relative to the cost.
+    solver_s : float
+    detail : str
+        The solver's own word for the status.
+    """
+
+    status: Status
+    x: NDArray[np.float64]
+    duals: list[Matrix]
+    accuracy: float
+    solver_s: float
+    detail: str
+
+
+def solve_cones(problem: Cones, tolerance: float = 1e-8) -> Raw:
+    """Solve a program in Clarabel's standard form.
+
+    Parameters
+    ----------
+    problem : Cones
+    tolerance : float
+        Relative gap and residuals at which the solver ends.
+    """
+    settings = _settings()
+    settings.tol_gap_rel = settings.tol_feas = tolerance
+    settings.tol_gap_abs = 0.1 * tolerance
+    cones = [clarabel.PSDTriangleConeT(size) if size > 1 else clarabel.NonnegativeConeT(1) for size in problem.sizes]
+    start = _clock()
+    answer = _run(Assembled(problem.q, problem.A, problem.b, cones, []), settings)
+    solver_s = _clock() - start
+    ends = np.cumsum([0, *(size * (size + 1) // 2 for size in problem.sizes)])
+    z = np.asarray(answer.z)
+    duals = [_unpacked(z[a:e], size) for a, e, size in zip(ends, ends[1:], problem.sizes, strict=False)]
+    cost, dual = float(answer.obj_val), float(answer.obj_val_dual)
+    gap = abs(cost - dual) / max(abs(cost), abs(dual), np.finfo(float).tiny)
+    detail = str(answer.status)
+    accuracy = max(float(answer.r_prim), float(answer.r_dual), gap)
+    return Raw(_STATUS.get(detail, Status.FAILED), np.asarray(answer.x), duals, accuracy, solver_s, detail)
+
+
 def assemble(variables: Mapping[str, Variable], statement: Statement) -> Assembled:
     """Evaluate a statement and return Clarabel's standard form."""
     offsets: dict[str, slice] = {}
@@ -245,7 +326,7 @@ def _rows_of(
     heights = [row[i].shape[0] for i, row in enumerate(blocks)]
     ends = np.concatenate([[0], np.cumsum(heights)])
     size = int(ends[-1])
-    packed, weight = _packing(size)
+    packed, weight = packing(size)
     constant = np.zeros((size, size))
     stack = np.zeros((count, size, size))
     for i, row in enumerate(blocks):
@@ -297,6 +378,7 @@ def _settings() -> Any:
     settings = clarabel.DefaultSettings()
     settings.verbose = False
     settings.chordal_decomposition_enable = False  # the matrices are dense
+    settings.direct_solve_method = "faer"  # supernodal: several times faster than the default on dense blocks
     settings.max_threads = 1
     return settings
 
@@ -332,14 +414,14 @@ def _basis(variable: Variable) -> NDArray[np.float64]:
 
 
 @lru_cache(maxsize=64)
-def _packing(size: int) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
-    """Return the flat indices of the upper triangle by columns, and the weights 1 and √2."""
+def packing(size: int) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
+    """Return the flat indices of the upper triangle by columns, and the weights 1 and √2 of the packed form."""
     j, i = np.tril_indices(size)
     return i * size + j, np.where(i == j, 1.0, _SQRT2)
 
 
 def _unpacked(z: NDArray[np.float64], size: int) -> Matrix:
-    packed, weight = _packing(size)
+    packed, weight = packing(size)
     flat = np.zeros(size * size)
     flat[packed] = z / weight
     matrix = flat.reshape(size, size)

@@ -11,7 +11,6 @@ import difflib
 import os
 import re
 import tempfile
-from collections.abc import Mapping
 from importlib import resources
 from pathlib import Path
 from typing import Literal, NamedTuple
@@ -19,10 +18,11 @@ from typing import Literal, NamedTuple
 import numpy as np
 import tomli_w
 
-from gains.certificate import claim_hash, gains_hash, model_hash
+from gains.gainfile import DELAY_LIMIT, content_of, read_gains, read_schedule
 from gains.model import (
     Actuator,
     Condition,
+    GainLaw,
     Gains,
     Matrix,
     Model,
@@ -39,9 +39,11 @@ __all__ = [
     "Stored",
     "load",
     "load_gains",
+    "load_law",
     "load_model",
     "model_path",
     "parse_gains",
+    "parse_law",
     "parse_model",
     "resolve",
     "save_gains",
@@ -49,7 +51,6 @@ __all__ = [
 ]
 
 TS_MIN_S, TS_MAX_S = 1e-6, 3600.0
-DELAY_LIMIT = 1000  # samples; buffers in the loop grow with d_max
 _SENSOR = re.compile(r"[A-Z][A-Z0-9_]*\.[A-Za-z][A-Za-z0-9_]*")
 
 Kind = Literal["model", "gains"]
@@ -105,20 +106,31 @@ def load_model(name_or_path: str | Path) -> Model:
 
 
 def load_gains(name_or_path: str | Path) -> Gains:
-    """Return the gains of a file together with the model it names.
+    """Return the one set of gains of a file together with the model it names.
+
+    Raises
+    ------
+    InputError
+        Naming the file, the field, what was expected and what was found; for a schedule too.
+    """
+    return parse_gains(Table.load(resolve(name_or_path)))
+
+
+def load_law(name_or_path: str | Path) -> GainLaw:
+    """Return the gains or the schedule of a file together with the model it names.
 
     Raises
     ------
     InputError
         Naming the file, the field, what was expected and what was found.
     """
-    return parse_gains(Table.load(resolve(name_or_path)))
+    return parse_law(Table.load(resolve(name_or_path)))
 
 
-def load(name_or_path: str | Path) -> Model | Gains:
-    """Return the model or the gains of a file, whichever it holds."""
+def load(name_or_path: str | Path) -> Model | GainLaw:
+    """Return the model, the gains or the schedule of a file, whichever it holds."""
     table = Table.load(resolve(name_or_path))
-    return parse_model(table) if _kind(table) == "model" else parse_gains(table)
+    return parse_model(table) if _kind(table) == "model" else parse_law(table)
 
 
 def parse_model(table: Table) -> Model:
@@ -155,26 +167,23 @@ def parse_model(table: Table) -> Model:
 
 
 def parse_gains(table: Table) -> Gains:
-    """Return the gains that the table of a whole file describes, with their model."""
+    """Return the one set of gains that the table of a whole file describes, with its model."""
+    if _kind(table) == "gains" and "window" in table:
+        raise table.error("window", "one set of gains (d_min, d_max, K1)", "a schedule")
+    law = parse_law(table)
+    assert isinstance(law, Gains)
+    return law
+
+
+def parse_law(table: Table) -> GainLaw:
+    """Return the gains or the schedule that the table of a whole file describes, with the model."""
     if _kind(table) != "gains":
         raise InputError(f"{table.source}: expected a gain file (model, K1), found a model file")
-    if "window" in table:
-        raise table.error("window", "K1 and K2", "a schedule; schedules are not supported by this version")
     name = table.string("name")
     model = parse_model(Table.load(_model_path(table)))
-    d_min = table.integer("d_min", low=0, high=DELAY_LIMIT)
-    d_max = table.integer("d_max", low=d_min, high=DELAY_LIMIT)
-    K1 = table.matrix("K1", shape=(model.nu, model.nx))
-    K2: Matrix | None = None
-    if model.reference is not None:
-        K2 = table.matrix("K2", shape=(model.nu, model.nr))
-    elif "K2" in table:
-        raise table.error("K2", f"none, as model {model.name} has no [reference]", "one")
-    certificate = table.mapping("certificate", None)
-    if certificate is not None:
-        _check_hashes(certificate, table.source, model, K1, K2)
+    law = (read_schedule if "window" in table else read_gains)(table, name, model)
     table.finish()
-    return Gains(name, model, d_min, d_max, K1, K2, certificate)
+    return law
 
 
 def model_path(gains_name_or_path: str | Path) -> Path:
@@ -188,13 +197,13 @@ def model_path(gains_name_or_path: str | Path) -> Path:
     return _model_path(Table.load(resolve(gains_name_or_path)))
 
 
-def save_gains(path: str | Path, gains: Gains, model: str | Path) -> None:
+def save_gains(path: str | Path, gains: GainLaw, model: str | Path) -> None:
     """Write a gain file, with its certificate if it has one; a file of that name is replaced at once or not at all.
 
     Parameters
     ----------
     path : str or Path
-    gains : Gains
+    gains : Gains or Schedule
         Every number is written at full double precision.
     model : str or Path
         The stored name or the file of the model; the file names it relative to itself.
@@ -202,12 +211,7 @@ def save_gains(path: str | Path, gains: Gains, model: str | Path) -> None:
     path, file = Path(path), resolve(model)
     stored_names = {stored_file: name for name, stored_file in _stored_paths().items()}
     reference = stored_names.get(file) or os.path.relpath(file.resolve(), path.resolve().parent)
-    content: dict[str, object] = {"name": gains.name, "model": reference, "d_min": gains.d_min, "d_max": gains.d_max}
-    content["K1"] = gains.K1.tolist()
-    if gains.K2 is not None:
-        content["K2"] = gains.K2.tolist()
-    if gains.certificate is not None:
-        content["certificate"] = dict(gains.certificate)
+    content = content_of(gains, reference)
     handle, temporary = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
     try:
         with os.fdopen(handle, "wb") as out:
@@ -228,22 +232,6 @@ def _model_path(table: Table) -> Path:
     except InputError as error:
         prefix = f"{table.source}: "
         raise InputError(str(error) if str(error).startswith(prefix) else f"{prefix}model: {error}") from None
-
-
-def _check_hashes(certificate: Mapping[str, object], source: str, model: Model, K1: Matrix, K2: Matrix | None) -> None:
-    """Refuse a certificate that was made for another model or other gains, or that has been changed."""
-    hashes = Table(certificate, source, "certificate").table("sha256")
-    actual_hashes = {
-        "model": (f"model {model.name}", model_hash(model)),
-        "gains": ("K1 and K2", gains_hash(K1, K2)),
-        "certificate": ("the certificate", claim_hash(certificate)),
-    }
-    for key, (what, actual) in actual_hashes.items():
-        expected = hashes.string(key)
-        if expected != actual:
-            raise hashes.error(
-                key, f"the hash of {what}, {actual[:12]}…", f"{expected[:12]}…: made for another, or changed"
-            )
 
 
 def _stored_paths() -> dict[str, Path]:

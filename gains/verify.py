@@ -9,44 +9,19 @@ powers of two, which rounds nothing and makes margin and bound independent of un
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 
 from gains.certificate import MAX_DELAY, Certificate, read_certificate
-from gains.model import Gains, Matrix
+from gains.definite import EPS, LEAST, MOST, UNDERFLOW, Verification, definite, failed
+from gains.model import GainLaw, Gains, Matrix, Schedule
+from gains.switched_certificate import SwitchedCertificate, read_switched
+from gains.verify_switched import check_switched
 
 __all__ = ["Verification", "check", "least_eta", "verified"]
 
-_EPS = float(np.finfo(np.float64).eps)
-_LEAST, _MOST = 1e-100, 1e100  # what a certificate and a model may hold: products stay far from under- and overflow
-_UNDERFLOW = 1e-200  # more than all that underflow can take from an entry between those limits
-_EIGENVALUES = 8  # LAPACK's symmetric eigenvalues err by less than this times N eps times the norm
 
-
-@dataclass(frozen=True, slots=True)
-class Verification:
-    """Whether a certificate proves what it says.
-
-    Attributes
-    ----------
-    passed : bool
-    margin : float
-        The smallest eigenvalue among the matrices that shall be positive definite, each with a diagonal near
-        1; that of the matrix whose margin is least beside its rounding.
-    rounding : float
-        Bound on the error of that eigenvalue; ``margin > rounding`` in every matrix is what passed means.
-    reason : str
-        What failed; empty if nothing did.
-    """
-
-    passed: bool
-    margin: float
-    rounding: float
-    reason: str
-
-
-def verified(gains: Gains) -> Verification:
+def verified(gains: GainLaw) -> Verification:
     """Return whether the certificate in a gain file proves its whole window of delays.
 
     Raises
@@ -55,16 +30,24 @@ def verified(gains: Gains) -> Verification:
         When a field of the certificate is missing or malformed.
     """
     if gains.certificate is None:
-        return _failed("there is no certificate")
+        return failed("there is no certificate")
+    if gains.certificate.get("method") == SwitchedCertificate.method:
+        exact = read_switched(gains)
+        return _outside(gains, exact) or check_switched(gains, exact)
     certificate = read_certificate(gains)
     if certificate is None:
-        return _failed(f"method {gains.certificate.get('method')!r} cannot be verified by this version")
-    if gains.d_min < certificate.d_min or gains.d_max > certificate.d_max:
-        window = f"{gains.d_min} to {gains.d_max}"
-        return _failed(
-            f"the gains are for delays {window}, the certificate for {certificate.d_min} to {certificate.d_max}"
-        )
-    return check(gains, certificate)
+        return failed(f"method {gains.certificate.get('method')!r} cannot be verified by this version")
+    if isinstance(gains, Schedule):
+        return failed(f"a schedule cannot be verified: {certificate.method} certificates speak of one set of gains")
+    return _outside(gains, certificate) or check(gains, certificate)
+
+
+def _outside(gains: GainLaw, certificate: Certificate | SwitchedCertificate) -> Verification | None:
+    """Return a failure where the window of the gains is not that of the certificate or inside it."""
+    if certificate.d_min <= gains.d_min and gains.d_max <= certificate.d_max:
+        return None
+    window = f"{gains.d_min} to {gains.d_max}"
+    return failed(f"the gains are for delays {window}, the certificate for {certificate.d_min} to {certificate.d_max}")
 
 
 def check(gains: Gains, certificate: Certificate) -> Verification:
@@ -72,21 +55,21 @@ def check(gains: Gains, certificate: Certificate) -> Verification:
     weights = [certificate.P, certificate.Q, certificate.R]
     unusable = _unusable(gains, certificate)
     if unusable:
-        return _failed(unusable)
+        return failed(unusable)
     results: list[Verification] = []
     for name, X in zip(("P", "Q", "R"), weights, strict=True):
         if not np.array_equal(X, X.T):
-            return _failed(f"{name} is not symmetric")
-        results.append(_definite(X, np.zeros_like(X), f"{name} is not positive definite"))
-    failed = [result for result in results if not result.passed]
-    if failed:
-        return failed[0]
+            return failed(f"{name} is not symmetric")
+        results.append(definite(X, np.zeros_like(X), f"{name} is not positive definite"))
+    broken = [result for result in results if not result.passed]
+    if broken:
+        return broken[0]
     beyond = _beyond_reckoning(gains, certificate)
     if beyond:
-        return _failed(beyond)
+        return failed(beyond)
     with np.errstate(over="ignore", invalid="ignore"):
         matrix, error = _inequality(gains, certificate)
-        results.append(_definite(-matrix, error, "the inequality of Lemma 1 does not hold"))
+        results.append(definite(-matrix, error, "the inequality of Lemma 1 does not hold"))
     return min(results, key=lambda v: (v.passed, v.margin / v.rounding if v.rounding > 0.0 else -math.inf))
 
 
@@ -110,9 +93,9 @@ def _beyond_reckoning(gains: Gains, certificate: Certificate) -> str:
     weights = [certificate.P, certificate.Q, certificate.R]
     scalars = [certificate.mu or 1.0, certificate.eta or 1.0, certificate.delta_max or 1.0]
     sizes = np.concatenate([*(np.abs(np.diag(X)) for X in weights), scalars])
-    if sizes.min() < _LEAST or max(sizes.max(), *(np.abs(X).max() for X in weights)) > _MOST:
+    if sizes.min() < LEAST or max(sizes.max(), *(np.abs(X).max() for X in weights)) > MOST:
         return "a number is too small or too large to be computed with"
-    if max(np.abs(part).max(initial=0.0) for part in _maps(gains, certificate.delta_max, modulus=True)) > _MOST:
+    if max(np.abs(part).max(initial=0.0) for part in _maps(gains, certificate.delta_max, modulus=True)) > MOST:
         return "a number of the model or the gains is too large to be computed with"
     return ""
 
@@ -178,7 +161,7 @@ def _inequality(gains: Gains, certificate: Certificate) -> tuple[Matrix, Matrix]
     if certificate.eta is None:
         keep[2 * n : 2 * n + m] = False
     matrix = (matrix + matrix.T) / 2
-    return matrix[np.ix_(keep, keep)], operations * _EPS * bound[np.ix_(keep, keep)] + _UNDERFLOW
+    return matrix[np.ix_(keep, keep)], operations * EPS * bound[np.ix_(keep, keep)] + UNDERFLOW
 
 
 def _maps(gains: Gains, delta_max: float, *, modulus: bool = False) -> tuple[Matrix, Matrix, Matrix]:
@@ -209,26 +192,3 @@ def _maps(gains: Gains, delta_max: float, *, modulus: bool = False) -> tuple[Mat
         if gains.K2 is not None:
             right[:, xr] = of(uncertainty.J2) @ of(gains.K2)
     return step, output, right
-
-
-def _definite(matrix: Matrix, error: Matrix, reason: str) -> Verification:
-    """Return whether a symmetric matrix, known up to an error in each entry, is positive definite."""
-    diagonal = np.diag(matrix)
-    if not (np.isfinite(matrix).all() and np.all(diagonal > 0.0)):
-        return _failed(reason)
-    unit = np.exp2(-np.rint(np.log2(diagonal) / 2))
-    scaled = matrix * unit[:, None] * unit[None, :]
-    if np.diag(scaled).min() < 0.25 or np.diag(scaled).max() > 4.0:
-        return _failed(reason)
-    try:
-        margin = float(np.linalg.eigvalsh(scaled)[0])
-    except np.linalg.LinAlgError:
-        return _failed(f"{reason}: its eigenvalues could not be computed")
-    rounding = float(np.max(np.sum(error * unit[:, None] * unit[None, :], axis=1)))
-    rounding += _EIGENVALUES * len(diagonal) * _EPS * float(np.linalg.norm(scaled))
-    passed = margin > rounding
-    return Verification(passed, margin, rounding, "" if passed else reason)
-
-
-def _failed(reason: str) -> Verification:
-    return Verification(False, -math.inf, 0.0, reason)

@@ -20,8 +20,10 @@ from autopilot.link.wire import AUTOPILOT, frames_of
 from gains.command import NEGATIVE, SUCCESS, FiniteRange, print_json, run, version
 from gains.store import load_model
 from gains.table import InputError
+from gains.witnessfile import read_witness
 from sitl.aircraft.disturbance import HarmonicGust, SquareDelta
 from sitl.fly import DEFAULT_PORT_BASE, FlightOptions, fly
+from sitl.gate import Gate, check_flyable
 from sitl.linkspec import PRESETS, parse_link, parse_spec
 from sitl.plant import DEFAULT_SERVO_TIMEOUT, PlantConfig, PlantNode
 from sitl.processes import FlightFailed
@@ -140,6 +142,8 @@ def _link_options(command: Any) -> Any:
               help="What a client must send to be heard: a frame of the autopilot, or anything.")  # fmt: skip
 @_link_options
 @click.option("--seed", type=SEED, default=1, show_default=True)
+@click.option("--witness", "witness_name", type=click.Path(dir_okay=False),
+              help="Time the commands so that the plant lives the delay sequence of this file.")  # fmt: skip
 @process_options
 def relay(
     address: Address,
@@ -150,14 +154,19 @@ def relay(
     up: str | None,
     down: str | None,
     seed: int,
+    witness_name: str | None,
     **process: Any,
 ) -> None:
     """Delay, lose and reorder what passes between a client and the plant. Runs until Ctrl-C."""
     link = parse_link(preset, up, down)
+    witness = None if witness_name is None else read_witness(witness_name)
+    if witness is not None:
+        check_flyable(witness, str(witness_name))
     heard = frames_of(AUTOPILOT) if accept == "mavlink" else lambda _datagram: True
     openers = [partial(listen, "autopilot", address, peer=peer, accept=heard), partial(dial, "plant", to)]
     metadata = {"program": "sitl relay", "seed": str(seed), "lagproof": version()}
-    run_node("relay", RelayNode(*link, seed), openers, ProcessOptions(**process), metadata, tap=False)
+    node = RelayNode(*link, seed, None if witness is None else Gate(witness))
+    run_node("relay", node, openers, ProcessOptions(**process), metadata, tap=False)
 
 
 @cli.command("fly")

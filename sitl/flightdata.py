@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from autopilot.reference import parse_profile
 from gains.model import Matrix, Model
+from sitl.impairment import Fate
 
 __all__ = ["FlightData", "FlightEvent", "LinkPackets", "ModeInterval"]
 
@@ -39,7 +40,7 @@ class FlightEvent(NamedTuple):
 
 
 class LinkPackets(NamedTuple):
-    """The packets of one direction; duplicates count as packets.
+    """The packets of one direction; duplicates count as packets, what a gate swallowed does not.
 
     Attributes
     ----------
@@ -209,7 +210,8 @@ class _Collected:
                 self.commands[self.starts[-1] + body["j"]] = body
                 self.modes.append((log_time_ns, body["mode"]))
             case "link/up" | "link/down":
-                self.links[topic.removeprefix("link/")].append((log_time_ns, body))
+                if body["fate"] != Fate.GATED:
+                    self.links[topic.removeprefix("link/")].append((log_time_ns, body))
             case "events":
                 self.events.append((log_time_ns, body))
                 if body["kind"] == "failsafe":

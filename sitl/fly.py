@@ -120,6 +120,7 @@ def _metadata(scenario: Scenario, options: FlightOptions) -> dict[str, str]:
         "Ts": repr(scenario.plant.Ts),
         "actuator": scenario.actuator,
         "reference": scenario.reference,
+        **({} if scenario.witness_name is None else {"witness": Path(scenario.witness_name).name}),
         "time": "virtual" if options.virtual else "udp",
         "lagproof": version(),
     }

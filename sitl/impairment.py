@@ -174,6 +174,8 @@ class Fate(StrEnum):
     LOST = "lost"
     BLACKOUT = "blackout"
     REFUSED = "refused"
+    GATED = "gated"
+    """Swallowed by the gate, :mod:`sitl.gate`: no sample of the witness asks for it."""
 
 
 class Copy(NamedTuple):

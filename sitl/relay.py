@@ -2,23 +2,29 @@
 
 A datagram from port ``plant`` goes *up* and leaves by port ``autopilot``; one from ``autopilot`` goes
 *down* and leaves by ``plant``. What is under way waits in one heap, in order of exit, then of entry.
+At the plant's end there may be a gate, which times the commands: it sees the plant's packets as they enter
+and the autopilot's as they would leave.
 
 Conservation, per direction and at every instant::
 
-    sent + duplicated = delivered + lost + refused + queued
+    sent + duplicated = delivered + lost + refused + gated + queued
 
-``sent`` counts packets, ``duplicated`` the second copies made of them; each copy then has one fate.
+``sent`` counts packets, ``duplicated`` the further copies made of them, by chance or by the gate; each copy
+then has one fate. ``queued`` includes what waits at the gate.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from heapq import heappop, heappush
 from typing import NamedTuple
 
 import numpy as np
 
+from autopilot.link.clock import NS_PER_S
 from autopilot.link.node import Datagram, Record
+from sitl.gate import Gate, GateStep, Miss
 from sitl.impairment import Fate, Impairment, LinkSpec
 
 __all__ = ["MAX_QUEUED", "Counters", "RelayNode"]
@@ -41,8 +47,10 @@ class Counters:
         Copies lost by chance or to a blackout.
     refused : int
         Copies the queue had no room for.
+    gated : int
+        Copies that the gate swallowed.
     duplicated : int
-        Second copies made, whatever became of them.
+        Further copies made, whatever became of them.
     reordered : int
         Copies that left after a copy of a packet that had entered later.
     bytes : int
@@ -53,6 +61,7 @@ class Counters:
     delivered: int = 0
     lost: int = 0
     refused: int = 0
+    gated: int = 0
     duplicated: int = 0
     reordered: int = 0
     bytes: int = 0
@@ -97,15 +106,20 @@ class RelayNode:
         From port ``autopilot`` to port ``plant``.
     seed : int
         Seed of both directions, which draw from independent streams.
+    gate : Gate, optional
+        Times the commands at the plant's end.
     """
 
-    def __init__(self, up: LinkSpec, down: LinkSpec, seed: int) -> None:
+    def __init__(self, up: LinkSpec, down: LinkSpec, seed: int, gate: Gate[_Packet] | None = None) -> None:
         up_rng, down_rng = (
             np.random.Generator(np.random.PCG64(child)) for child in np.random.SeedSequence(seed).spawn(2)
         )
         self._up = _Direction("link/up", "autopilot", Impairment(up, up_rng))
         self._down = _Direction("link/down", "plant", Impairment(down, down_rng))
         self._entries = {"plant": self._up, "autopilot": self._down}
+        self._gate = gate
+        self._told_misses: dict[Miss, int] = {}
+        self._next_misses_ns = 0
         self._heap: list[_Packet] = []
         self._sequence = 0
         self._start_ns: int | None = None
@@ -120,7 +134,7 @@ class RelayNode:
 
     @property
     def queued(self) -> dict[str, int]:
-        """How many copies are under way in each direction (``up``, ``down``)."""
+        """How many copies are under way in each direction (``up``, ``down``), at the gate or before it."""
         return {"up": self._up.queued, "down": self._down.queued}
 
     def receive(self, port: str, datagram: bytes, now_ns: int) -> None:
@@ -130,6 +144,9 @@ class RelayNode:
             self._start_ns = now_ns
         if self._heap:
             self._release(now_ns)
+        if self._gate is not None and direction is self._up:
+            self._obey(self._gate.sense(datagram), now_ns)
+            self._tell_misses(self._gate.misses, now_ns)
         counters = direction.counters
         counters.sent += 1
         number = counters.sent
@@ -172,6 +189,38 @@ class RelayNode:
             self._settle(packet, now_ns)
 
     def _settle(self, packet: _Packet, now_ns: int) -> None:
+        """Let a copy meet its fate at ``now_ns``; a command that would leave goes to the gate instead."""
+        if self._gate is not None and packet.direction is self._down and packet.fate is Fate.DELIVERED:
+            step = self._gate.command(packet.payload, packet)
+            if step is not None:
+                self._down.queued += 1  # until the gate lets go of it, which may be at once
+                self._obey(step, now_ns)
+                return
+        self._conclude(packet, now_ns)
+
+    def _obey(self, step: GateStep[_Packet], now_ns: int) -> None:
+        """Do what the gate decided. A command that goes to the plant again is a further copy."""
+        down = self._down
+        for packet, times in step.released:
+            if times:
+                down.counters.duplicated += 1
+            else:
+                down.queued -= 1
+            self._conclude(packet._replace(copy=packet.copy + times), now_ns)
+        for packet in step.dropped:
+            down.queued -= 1
+            self._conclude(packet._replace(fate=Fate.GATED), now_ns)
+
+    def _tell_misses(self, misses: Mapping[Miss, int], now_ns: int) -> None:
+        """Record what the gate could not do as prescribed, when that has changed; at most once a second."""
+        if now_ns < self._next_misses_ns or misses == self._told_misses:
+            return
+        self._next_misses_ns, self._told_misses = now_ns + NS_PER_S, dict(misses)
+        data = {"gate": {miss.value: n for miss, n in misses.items()}}
+        body = {"kind": "counters", "node": "relay", "text": "relay counters", "data": data}
+        self._records.append(Record("events", now_ns, body))
+
+    def _conclude(self, packet: _Packet, now_ns: int) -> None:
         """Count and record a copy whose fate is fulfilled at ``now_ns``; send it if that is delivery."""
         direction = packet.direction
         counters = direction.counters
@@ -187,6 +236,8 @@ class RelayNode:
             self._outgoing.append((direction.exit_port, packet.payload))
         elif packet.fate is Fate.REFUSED:
             counters.refused += 1
+        elif packet.fate is Fate.GATED:
+            counters.gated += 1
         else:
             counters.lost += 1
         body = {

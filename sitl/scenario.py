@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from importlib import resources
 from pathlib import Path
-from typing import Literal
+from typing import Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,10 +20,12 @@ from autopilot.app import AutopilotConfig, AutopilotNode
 from autopilot.link.clock import Clock
 from autopilot.link.process import format_clock, parse_clock
 from autopilot.reference import parse_profile
-from gains.model import Gains, Model
-from gains.store import load_gains, load_model
+from gains.model import GainLaw, Model
+from gains.store import load_law, load_model
 from gains.table import InputError, Table
+from gains.witnessfile import Witness, read_witness
 from sitl.aircraft.disturbance import HarmonicGust, SquareDelta
+from sitl.gate import Gate, check_flyable
 from sitl.impairment import LinkSpec
 from sitl.linkspec import format_spec, parse_link
 from sitl.plant import PlantConfig, PlantNode
@@ -53,7 +55,9 @@ MAX_SEED = 2**63 - 1
 LINK_COUNTS = ("sent", "delivered", "lost", "duplicated", "reordered")
 
 SERVO_TIMEOUT_MARGIN = 5
-"""The plant's servo time-out is d_max and this many samples, unless a scenario says otherwise."""
+"""The plant's servo time-out is d_max, of gains or witness, and this many samples, unless a scenario says otherwise."""
+
+_Word = TypeVar("_Word", bound=str)
 
 
 METRICS = frozenset(
@@ -69,6 +73,7 @@ METRICS = frozenset(
         "delay.unknown_fraction",
         *(f"link.{way}.{n}" for way in ("up", "down") for n in LINK_COUNTS),
         "failsafe_events",
+        "failsafe_reaction_samples",
         "mode_at_end",
         "longest_saturation_s",
         "reentry_saturation_s",
@@ -76,6 +81,12 @@ METRICS = frozenset(
     }
 )
 """What of a summary a check may judge; of a variant's too, after ``variants.NAME.``."""
+
+WITNESS_METRICS = frozenset(
+    f"witness.{name}"
+    for name in ("predicted", "growth_per_sample", "growth_error", "mismatches", "mismatch_fraction", "gated")
+)
+"""And these, where the link replays a witness."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,7 +122,7 @@ class Scenario:
         Short and long name.
     gains_name, plant_name : str
         What the gains and the plant were loaded from: stored names or paths.
-    gains : Gains
+    gains : Gains or Schedule
         What flies, on the model it was designed for.
     plant : Model
         What is flown, as a rule that same model.
@@ -135,6 +146,10 @@ class Scenario:
         Eq. (52).
     delta : SquareDelta or None
         Eq. (51).
+    witness_name : str or None
+        File of the delay sequence that the link imposes.
+    witness : Witness or None
+        That sequence.
     checks : tuple of Check
         What must hold at the end.
     variants : mapping
@@ -145,7 +160,7 @@ class Scenario:
     title: str
     gains_name: str
     plant_name: str
-    gains: Gains
+    gains: GainLaw
     plant: Model
     duration_s: float
     seed: int
@@ -160,6 +175,8 @@ class Scenario:
     x0: NDArray[np.float64] | None = None
     gust: HarmonicGust | None = None
     delta: SquareDelta | None = None
+    witness_name: str | None = None
+    witness: Witness | None = None
     checks: tuple[Check, ...] = ()
     variants: Mapping[str, Scenario] = field(default_factory=dict)
 
@@ -174,7 +191,7 @@ class Scenario:
 
     def relay_node(self) -> RelayNode:
         """Return the relay, new."""
-        return RelayNode(self.up, self.down, self.seed)
+        return RelayNode(self.up, self.down, self.seed, None if self.witness is None else Gate(self.witness))
 
     def autopilot_node(self, ground_stations: int) -> AutopilotNode:
         """Return the autopilot, new."""
@@ -213,10 +230,16 @@ def load_scenario(name_or_path: str, *, gains: str | None = None, plant: str | N
 def _parse(table: Table, name: str, gains_name: str | None, plant_name: str | None) -> Scenario:
     file_gains, file_plant = table.string("gains"), table.string("plant")
     gains_name, plant_name = gains_name or file_gains, plant_name or file_plant
-    gains, plant = load_gains(gains_name), load_model(plant_name)
+    gains, plant = load_law(gains_name), load_model(plant_name)
     _check_fit(gains, plant)
     link = table.table("link", default=None)
     up, down = parse_link(*((link.string(key, default=None) if link else None) for key in ("preset", "up", "down")))
+    latch: Literal["newest", "last"] = _choice(table, "latch", ("newest", "last"), "newest")
+    witness_name = _witness_name(table, link)
+    witness = None if witness_name is None else read_witness(witness_name)
+    if witness is not None:
+        check_flyable(witness, str(witness_name), latch, plant)
+    longest = gains.d_max if witness is None else max(gains.d_max, witness.d_max)
     clocks = table.table("clocks", default=None)
     variants = table.table("variant", default=None)
     scenario = Scenario(
@@ -235,11 +258,19 @@ def _parse(table: Table, name: str, gains_name: str | None, plant_name: str | No
             node: parse_clock(clocks.string(node, default=text) if clocks else text)
             for node, text in DEFAULT_CLOCKS.items()
         },
-        servo_timeout=_servo_timeout(table, gains),
+        actuator=_choice(table, "actuator", ("pwm", "float"), "pwm"),
+        failsafe=_choice(table, "failsafe", ("on", "monitor"), "on"),
+        latch=latch,
+        servo_timeout=_servo_timeout(table, longest + SERVO_TIMEOUT_MARGIN),
         x0=table.vector("x0", length=plant.nx, default=None),
         gust=_gust(table, plant),
         delta=_delta(table, plant),
-        checks=tuple(_check(check, tuple(variants or ())) for check in table.tables("check", default=())),
+        witness_name=witness_name,
+        witness=witness,
+        checks=tuple(
+            _check(check, METRICS if witness is None else METRICS | WITNESS_METRICS, tuple(variants or ()))
+            for check in table.tables("check", default=())
+        ),
     )
     parse_profile(scenario.reference, gains.model.Ts)
     if variants is None:
@@ -247,7 +278,7 @@ def _parse(table: Table, name: str, gains_name: str | None, plant_name: str | No
     return replace(scenario, variants={v: _variant(scenario, variants.table(v)) for v in variants})
 
 
-def _check_fit(gains: Gains, plant: Model) -> None:
+def _check_fit(gains: GainLaw, plant: Model) -> None:
     """Refuse a plant that the gains' state or sampling does not describe."""
     if plant.states != gains.model.states or plant.Ts_ns != gains.model.Ts_ns:
         raise InputError(
@@ -256,8 +287,20 @@ def _check_fit(gains: Gains, plant: Model) -> None:
         )
 
 
-def _servo_timeout(table: Table, gains: Gains) -> int | None:
-    samples: int = table.integer("servo_timeout", default=gains.d_max + SERVO_TIMEOUT_MARGIN, low=0)
+def _choice(table: Table, key: str, words: tuple[_Word, ...], default: _Word) -> _Word:
+    """Return one of some words."""
+    chosen = table.string(key, default=default, choices=words)
+    return next(word for word in words if word == chosen)
+
+
+def _witness_name(table: Table, link: Table | None) -> str | None:
+    """Return the witness file of ``[link]``, to which the scenario's folder is the place to start from."""
+    name = link.string("witness", default=None) if link is not None else None
+    return None if name is None else str(table.folder / name)
+
+
+def _servo_timeout(table: Table, default: int | None) -> int | None:
+    samples: int = table.integer("servo_timeout", default=default or 0, low=0)
     return samples or None
 
 
@@ -280,7 +323,7 @@ def _delta(table: Table, plant: Model) -> SquareDelta | None:
     return SquareDelta(delta.number("amplitude", default=0.15), delta.integer("half_period", default=20, low=1))
 
 
-def _check(table: Table, variants: tuple[str, ...]) -> Check:
+def _check(table: Table, metrics: frozenset[str], variants: tuple[str, ...]) -> Check:
     """Return a check, its metric one that there will be."""
     check = Check(
         table.string("name"),
@@ -291,7 +334,7 @@ def _check(table: Table, variants: tuple[str, ...]) -> Check:
     )
     if check.at_most is None and check.at_least is None and check.equals is None:
         raise table.error("at_most", "at_most, at_least or equals", "none")
-    known = {*METRICS, *(f"variants.{variant}.{metric}" for variant in variants for metric in METRICS)}
+    known = {*metrics, *(f"variants.{variant}.{metric}" for variant in variants for metric in metrics)}
     if check.metric not in known:
         near = difflib.get_close_matches(check.metric, known, 1)
         raise table.error(
@@ -302,7 +345,12 @@ def _check(table: Table, variants: tuple[str, ...]) -> Check:
 
 def _variant(scenario: Scenario, table: Table) -> Scenario:
     """Return the scenario with what the variant's table changes."""
-    return replace(scenario, servo_timeout=_servo_timeout(table, scenario.gains), checks=())
+    return replace(
+        scenario,
+        failsafe=_choice(table, "failsafe", ("on", "monitor"), scenario.failsafe),
+        servo_timeout=_servo_timeout(table, scenario.servo_timeout),
+        checks=(),
+    )
 
 
 def plant_arguments(scenario: Scenario) -> list[str]:
@@ -322,6 +370,8 @@ def plant_arguments(scenario: Scenario) -> list[str]:
 def relay_arguments(scenario: Scenario) -> list[str]:
     """Return the options with which ``sitl relay`` builds the scenario's link."""
     arguments = ["--up", format_spec(scenario.up), "--down", format_spec(scenario.down)]
+    if scenario.witness_name is not None:
+        arguments += ["--witness", scenario.witness_name]
     return [*arguments, "--seed", str(scenario.seed), "--clock", format_clock(scenario.clocks["relay"])]
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -12,10 +13,12 @@ from rich.table import Table as Grid
 from rich.text import Text
 
 from autopilot.failsafe import Mode
-from gains.model import Gains
+from gains.model import GainLaw
 from gains.verify import verified
 from sitl.flightdata import FlightData
+from sitl.impairment import Fate
 from sitl.scenario import LINK_COUNTS, Check, Scenario
+from sitl.witness import witness_summary
 
 __all__ = ["LATE_NS", "Verdict", "delay_summary", "judge", "link_summary", "summarise", "summary_table"]
 
@@ -24,6 +27,9 @@ LATE_NS = 1_000_000
 
 REENTRY_S = 2.0
 """How long after a re-entry to TRACKING its saturation is looked at."""
+
+SAME_INSTANT_NS = 100_000
+"""Records of two programs within a tenth of a millisecond may stand in the wrong order."""
 
 MAX_BARS = 6
 """Delays that the table lists one by one."""
@@ -60,7 +66,7 @@ def summarise(scenario: Scenario, kept: Sequence[Kept], flight: FlightData, *, v
     last_second = max(1, round(1.0 / scenario.plant.Ts))
     transitions = [body for topic, _, body in kept if topic == "events" and body["kind"] == "failsafe"]
     leaving = [t for t in transitions if t["data"]["from"] != Mode.STANDBY]
-    return {
+    summary = {
         "scenario": scenario.name,
         "title": scenario.title,
         "gains": scenario.gains.name,
@@ -78,15 +84,20 @@ def summarise(scenario: Scenario, kept: Sequence[Kept], flight: FlightData, *, v
         "delay": delay_summary(flight),
         "link": link_summary(kept),
         "failsafe_events": len(leaving),
+        "failsafe_reaction_samples": failsafe_reaction_samples(kept, scenario),
         "failsafe_transitions": [t["text"] for t in transitions],
         "mode_at_end": flight.modes[-1].mode if flight.modes else Mode.STANDBY.value,
         "longest_saturation_s": _longest(_at_limit(flight)) * scenario.plant.Ts,
         "reentry_saturation_s": _reentry_saturation_s(flight),
         "late_ticks": int(np.count_nonzero(flight.late_ns > LATE_NS)),
     }
+    if scenario.witness is not None:
+        gated = sum(topic == "link/down" and body["fate"] == Fate.GATED for topic, _, body in kept)
+        summary["witness"] = {**witness_summary(scenario.witness, flight, _at_limit(flight)), "gated": gated}
+    return summary
 
 
-def _certificate(gains: Gains) -> str:
+def _certificate(gains: GainLaw) -> str:
     """Return what is proved of the gains, in a few words."""
     proof = verified(gains)
     if not proof.passed or gains.certificate is None:
@@ -120,7 +131,10 @@ def delay_summary(flight: FlightData) -> dict[str, Any]:
 
 
 def link_summary(kept: Iterable[Kept]) -> dict[str, dict[str, int]]:
-    """Return the packet counts of each direction; ``sent`` counts each packet once, the others its copies."""
+    """Return the packet counts of each direction; ``sent`` counts each packet once, the others its copies.
+
+    What a gate swallowed is in none but ``sent``.
+    """
     summary = {}
     for way in ("up", "down"):
         summary[way] = dict.fromkeys(LINK_COUNTS, 0)
@@ -132,13 +146,39 @@ def link_summary(kept: Iterable[Kept]) -> dict[str, dict[str, int]]:
         counts = summary[way]
         counts["duplicated" if body["copy"] else "sent"] += 1
         if body["delivered_ns"] is None:
-            counts["lost"] += 1
+            counts["lost"] += body["fate"] != Fate.GATED
             continue
         counts["delivered"] += 1
         if body["number"] < newest[way]:
             counts["reordered"] += 1
         newest[way] = max(newest[way], body["number"])
     return summary
+
+
+def failsafe_reaction_samples(kept: Iterable[Kept], scenario: Scenario) -> float | None:
+    """Return how long the autopilot stayed in TRACKING with the delay outside the gains' window; None if it never was.
+
+    In samples, the longest of the flight: from the record of a sample whose delay lies outside, as the plant
+    reports it, or of a command forecast to land outside, to the failsafe leaving TRACKING or the end.
+    """
+    low, high = scenario.gains.d_min, scenario.gains.d_max
+    changes: list[tuple[int, Mode]] = []
+    outside_ns: list[int] = []
+    end_ns = 0
+    for topic, at_ns, body in kept:
+        end_ns = max(end_ns, at_ns)
+        if topic == "events" and body["kind"] == "failsafe":
+            changes.append((at_ns, Mode(body["data"]["to"])))
+        elif topic in ("plant/truth", "autopilot/command") and body["d"] is not None and not low <= body["d"] <= high:
+            outside_ns.append(at_ns)
+    changes.sort(key=lambda change: change[0])
+    longest_ns = None
+    for at_ns in outside_ns:
+        following = bisect_left(changes, at_ns - SAME_INSTANT_NS, key=lambda change: change[0])
+        if following and changes[following - 1][1] is Mode.TRACKING:
+            left_ns = changes[following][0] if following < len(changes) else end_ns
+            longest_ns = max(longest_ns or 0, left_ns - at_ns)
+    return None if longest_ns is None else longest_ns / scenario.plant.Ts_ns
 
 
 def judge(checks: Iterable[Check], summary: Mapping[str, Any]) -> list[Verdict]:
@@ -204,6 +244,8 @@ def summary_table(summary: Mapping[str, Any], verdicts: Sequence[Verdict]) -> Gr
     for way, counts in summary["link"].items():
         grid.add_row(f"link {way}", "  ".join(f"{name} {n}" for name, n in counts.items()))
     grid.add_row("failsafe", f"{summary['failsafe_events']} transitions, {summary['mode_at_end']} at the end")
+    if "witness" in summary:
+        grid.add_row("witness", _witness_text(summary["witness"]))
     grid.add_row("late samples", f"{summary['late_ticks']} by more than 1 ms")
     for name, variant in summary.get("variants", {}).items():
         peak = np.degrees(variant["max_error_rad"])
@@ -223,7 +265,8 @@ def _histogram_text(histogram: Mapping[str, int]) -> str:
     shown = [f"d={d}: {n}" for d, n in list(histogram.items())[:MAX_BARS]]
     tail = list(histogram.items())[MAX_BARS:]
     if tail:
-        shown.append(f"d={tail[0][0]}..{tail[-1][0]}: {sum(n for _, n in tail)}")
+        last = tail[-1][0] if len(tail) == 1 else f"{tail[0][0]}..{tail[-1][0]}"
+        shown.append(f"d={last}: {sum(n for _, n in tail)}")
     return "  ".join(shown) or "no command arrived"
 
 
@@ -232,6 +275,14 @@ def _forecast_text(delay: Mapping[str, Any]) -> str:
         return "none scored"
     exact, near = delay["estimated_exact_fraction"], delay["within_one_fraction"]
     return f"exact {exact:.1%}, within one sample {near:.1%}, unknown {delay['unknown_fraction']:.1%}"
+
+
+def _witness_text(witness: Mapping[str, Any]) -> str:
+    grown = "too short to tell" if witness["growth_per_sample"] is None else f"{witness['growth_per_sample']:.6f}"
+    return (
+        f"growth per sample {grown}, predicted {witness['predicted']:.6f};"
+        f" {witness['mismatches']} of {witness['prescribed_samples']} samples lived another delay"
+    )
 
 
 def _claim(verdict: Verdict) -> str:

@@ -24,6 +24,7 @@ from autopilot.link.clock import NS_PER_S
 from autopilot.link.node import Record
 from autopilot.link.servo import travel_of
 from sitl.braille import Part, bar, count, fit, histogram, input_quantity, output_quantity, percent, plain, plot
+from sitl.impairment import Fate
 from sitl.scenario import Scenario
 
 __all__ = ["MODE_STYLES", "FlightView"]
@@ -155,7 +156,8 @@ class FlightView:
             case "link/up" | "link/down":
                 link = state.links[record.topic.removeprefix("link/")]
                 link["duplicated" if body["copy"] else "sent"] += 1
-                link["lost" if body["delivered_ns"] is None else "delivered"] += 1
+                if body["fate"] != Fate.GATED:
+                    link["lost" if body["delivered_ns"] is None else "delivered"] += 1
             case "events":
                 self._take_event(body, log_time_ns)
             case _:

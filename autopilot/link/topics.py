@@ -55,7 +55,7 @@ def _link_schema(title: str, way: str) -> Mapping[str, Any]:
         delivered_ns=_field("integer", "When it left the link, ns, relay's clock; null if lost.", nullable=True),
         number=_field("integer", "Number of the packet in the order of entering, from 1; copies share it."),
         size=_field("integer", "Payload, bytes."),
-        fate=_field("string", "What the link did with it: delivered, lost, and so on."),
+        fate=_field("string", "What the link did with it: delivered, lost, blackout, refused or gated."),
         copy=_field("integer", "0 for the packet itself, 1 and up for duplicates."),
     )
 
@@ -92,13 +92,14 @@ SCHEMAS: Mapping[str, Mapping[str, Any]] = MappingProxyType(
             d_high=_field("integer", "Greatest delay the forecast allows, samples; null if unknown.", nullable=True),
             status=_field("string", "Status of the delay estimate."),
             mode=_field("string", "Mode of the failsafe."),
+            gain_set=_field("integer", "Index of the schedule's set of gains in force; 0 with plain gains."),
         ),
         "link/up": _link_schema("Link up", "from the plant to the autopilot"),
         "link/down": _link_schema("Link down", "from the autopilot to the plant"),
         "events": _schema(
             "Events",
             "Something that happened: a change of mode, a failsafe, a fault, a new epoch.",
-            kind=_field("string", "What it was: mode, failsafe, fault, epoch, gains, counters, and so on."),
+            kind=_field("string", "What it was: mode, failsafe, fault, epoch, gains, gain_set, counters, and so on."),
             node=_field("string", "Which node it happened in."),
             text=_field("string", "One line for people."),
             data=_field("object", "Details, depending on kind.", properties={}, additionalProperties=True),

@@ -1,15 +1,17 @@
-"""The law, Eq. (9), by hand and by matrices."""
+"""The law, Eq. (9), by hand and by matrices; the choice of a schedule's set swept over windows and delays."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
+from itertools import combinations, pairwise
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from autopilot.control import Law, law_of
+from autopilot.control import TELL_NS, Law, SetChanges, Window, choose_set, law_of
 from gains.model import Gains, Trim
 from gains.store import load_gains
 from gains.table import InputError
@@ -75,3 +77,104 @@ def test_a_law_of_several_inputs_is_refused():
     two = replace(model, B=np.hstack([model.B, model.B]), D=np.zeros((1, 2)), trim=Trim(np.zeros(3), np.zeros(2)))
     with pytest.raises(InputError, match="one input"):
         law_of(Gains("two", two, 1, 2, np.vstack([HIRM.K1, HIRM.K1]), np.zeros((2, 3))))
+
+
+# a schedule
+
+DELAYS = (None, *range(-1, 8))
+
+
+def schedules() -> Iterator[tuple[Window, ...]]:
+    """Every row of up to four windows within 0 to 6 that rises and leaves no delay out."""
+    every = [(low, high) for low in range(7) for high in range(low, 7)]
+    for count in range(1, 5):
+        for windows in combinations(every, count):
+            if all(a[0] < b[0] <= a[1] + 1 <= b[1] for a, b in pairwise(windows)):
+                yield windows
+
+
+SCHEDULES = tuple(schedules())
+
+
+def room(window: Window, d: int) -> int:
+    """Return how far d is from the nearer end of its window."""
+    return min(d - window[0], window[1] - d)
+
+
+def test_the_chosen_set_has_a_window_that_contains_the_delay_whenever_any_has():
+    assert len(SCHEDULES) > 300
+    for windows in SCHEDULES:
+        for d in range(windows[0][0], windows[-1][1] + 1):
+            for present in range(len(windows)):
+                low, high = windows[choose_set(windows, present, d)]
+                assert low <= d <= high
+
+
+def test_the_present_set_stays_while_its_window_contains_the_delay():
+    for windows in SCHEDULES:
+        for present, (low, high) in enumerate(windows):
+            assert {choose_set(windows, present, d) for d in range(low, high + 1)} == {present}
+
+
+def test_an_unknown_delay_or_one_outside_every_window_changes_nothing():
+    for windows in SCHEDULES:
+        for d in DELAYS:
+            if d is None or not windows[0][0] <= d <= windows[-1][1]:
+                assert [choose_set(windows, i, d) for i in range(len(windows))] == list(range(len(windows)))
+
+
+def test_a_new_set_is_the_one_with_the_most_room_then_the_narrowest_then_the_first():
+    ties = 0
+    for windows in SCHEDULES:
+        for present in range(len(windows)):
+            for d in range(windows[0][0], windows[-1][1] + 1):
+                chosen = choose_set(windows, present, d)
+                if chosen == present:
+                    continue
+                others = [i for i, (low, high) in enumerate(windows) if low <= d <= high and i != chosen]
+                low, high = windows[chosen]
+                for i in others:
+                    assert room(windows[i], d) <= room((low, high), d)
+                    if room(windows[i], d) == room((low, high), d):
+                        width = windows[i][1] - windows[i][0]
+                        assert high - low < width or (high - low == width and chosen < i)
+                        ties += 1
+    assert ties > 10
+
+
+@pytest.mark.parametrize(
+    ("windows", "present", "d", "chosen"),
+    [
+        (((1, 3), (2, 6), (4, 9)), 0, 4, 1),  # room 2 against 0
+        (((1, 3), (2, 6), (4, 9)), 0, 6, 2),  # room 2 against 0
+        (((1, 1), (2, 4), (3, 6)), 0, 3, 1),  # room 1 against 0
+        (((1, 2), (3, 4)), 0, 3, 1),  # side by side
+        (((0, 6), (4, 9), (9, 12)), 2, 5, 1),  # room 1 each, and the second is narrower
+        (((0, 4), (2, 6), (5, 9)), 2, 3, 0),  # room 1 each, equally wide
+        (((0, 4), (2, 6), (5, 9)), 2, 2, 0),  # room 2 against 0
+    ],
+)
+def test_choices_by_hand(windows, present, d, chosen):
+    assert choose_set(windows, present, d) == chosen
+
+
+def test_a_delay_that_wanders_inside_an_overlap_switches_once():
+    windows, present, chosen = ((1, 3), (2, 6)), 0, []
+    for d in (1, 2, 3, 4, 3, 2, 3, 2, 4, 1, 2, 3):
+        present = choose_set(windows, present, d)
+        chosen.append(present)
+    assert chosen == [0, 0, 0, 1, 1, 1, 1, 1, 1, 0, 0, 0]
+
+
+@given(st.lists(st.tuples(st.integers(0, 3 * TELL_NS), st.integers(0, 3)), max_size=60))
+def test_changes_are_all_counted_and_told_of_at_most_once_a_second(flown):
+    changes, now_ns, told = SetChanges(), 0, []
+    for wait_ns, gain_set in flown:
+        now_ns += wait_ns
+        if count := changes.flown(gain_set, now_ns):
+            told.append((now_ns, count))
+        since_ns = now_ns - told[-1][0] if told else TELL_NS
+        assert changes.untold == 0 or since_ns < TELL_NS
+    assert all(later[0] - earlier[0] >= TELL_NS for earlier, later in pairwise(told))
+    assert changes.total == sum(a != b for (_, a), (_, b) in pairwise(flown))
+    assert sum(count for _, count in told) + changes.untold == changes.total

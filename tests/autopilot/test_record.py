@@ -83,6 +83,7 @@ def sample_records(k: int) -> list[Record]:
         "d_high": 3 if known else None,
         "status": "ok" if known else "unknown",
         "mode": "TRACKING",
+        "gain_set": 0,
     }
     packet = {
         "sent_ns": t_ns,

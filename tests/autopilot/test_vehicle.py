@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pytest
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from autopilot.link.wire import (
@@ -14,8 +15,10 @@ from autopilot.link.wire import (
     VfrHud,
     Wire,
 )
-from autopilot.vehicle import MAX_WAITING, Vehicle
-from tests.helpers import MS, S, parse
+from autopilot.vehicle import MAX_WAITING, Vehicle, banner
+from gains.model import Gains, Schedule
+from gains.verify import verified
+from tests.helpers import HIRM, MS, S, parse
 
 GCS = (255, 190)
 
@@ -152,3 +155,29 @@ def test_times_wrap_for_a_station_too():
     attitude, servo = read(vehicle)
     assert attitude.time_boot_ms == 9
     assert servo.time_usec == (now_ns // 1000) % (1 << 32)
+
+
+def scheduled(windows: list[tuple[int, int]]) -> Schedule:
+    sets = [Gains(f"set {i}", HIRM.model, low, high, HIRM.K1, HIRM.K2) for i, (low, high) in enumerate(windows)]
+    return Schedule("wide", HIRM.model, tuple(sets))
+
+
+@pytest.mark.parametrize(
+    ("windows", "text"),
+    [
+        ([(1, 2), (2, 4)], "2 gain sets: delay 1..2, 2..4"),
+        ([(d, d + 1) for d in range(8, 12)], "4 gain sets: delay 8..9, 9..10, 10..11, 11..12"),
+        ([(d, d + 1) for d in range(1, 40)], "39 gain sets: delay 1 to 40"),
+    ],
+)
+def test_the_windows_of_a_schedule_are_told_whole_or_as_one(windows: list[tuple[int, int]], text: str) -> None:
+    schedule = scheduled(windows)
+    certificate, sets = banner(schedule, verified(schedule))
+    assert certificate.text == "no verified certificate: schedule wide"
+    assert sets.text == text
+    assert len(sets.text) <= 50
+
+
+def test_one_set_of_gains_is_announced_in_one_text() -> None:
+    [text] = banner(HIRM, verified(HIRM))
+    assert text.text == "no verified certificate: gains hirm-paper"

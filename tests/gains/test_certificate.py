@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 import tomli_w
 
-from gains.certificate import Certificate, gains_hash, model_hash, read_certificate
+from gains.certificate import Certificate, gains_hash, law_hash, model_hash, read_certificate
 from gains.lyapunov import eta
-from gains.model import Gains
-from gains.store import load_gains, load_model, model_path, resolve, save_gains
+from gains.model import Gains, Schedule
+from gains.store import load_gains, load_law, load_model, model_path, resolve, save_gains
 from gains.table import InputError
 from gains.verify import verified
 
@@ -64,7 +64,7 @@ def tampered(path: Path, field: str, value: object) -> str:
         inner[key] = value
     path.write_text(tomli_w.dumps(data))
     with pytest.raises(InputError) as caught:
-        load_gains(path)
+        load_law(path)
     return str(caught.value)
 
 
@@ -134,3 +134,53 @@ def test_hashes_do_not_depend_on_the_last_bits_of_a_hold_but_on_everything_else(
     assert gains_hash(HIRM.K1, HIRM.K2) != gains_hash(np.nextafter(HIRM.K1, 9), HIRM.K2)
     assert gains_hash(HIRM.K1, HIRM.K2) != gains_hash(HIRM.K1, None)
     assert gains_hash(np.zeros((1, 1)), None) == gains_hash(-np.zeros((1, 1)), None)
+
+
+LOW, HIGH = replace(HIRM, name="s[0]", d_max=2), replace(HIRM, name="s[1]", d_min=2, K1=1.01 * HIRM.K1)
+SCHEDULE = Schedule("s", HIRM.model, (LOW, HIGH))
+
+
+def test_plain_gains_keep_the_hash_of_k1_and_k2() -> None:
+    assert law_hash(HIRM) == gains_hash(HIRM.K1, HIRM.K2)
+    assert law_hash(replace(HIRM, d_max=9)) == law_hash(HIRM)
+
+
+def test_the_hash_of_a_schedule_is_of_every_window_and_every_gain_in_their_order() -> None:
+    assert HIGH.K2 is not None
+    others = [
+        (LOW,),
+        (LOW, replace(HIGH, d_max=4)),
+        (LOW, replace(HIGH, d_min=3)),
+        (replace(LOW, K1=HIGH.K1), replace(HIGH, K1=LOW.K1)),
+        (LOW, replace(HIGH, K1=np.nextafter(HIGH.K1, 9))),
+        (LOW, replace(HIGH, K2=np.nextafter(HIGH.K2, 9))),
+    ]
+    hashes = {law_hash(Schedule("s", HIRM.model, sets)) for sets in others}
+    assert len(hashes | {law_hash(SCHEDULE), law_hash(HIRM)}) == len(others) + 2
+    assert law_hash(replace(SCHEDULE, name="other")) == law_hash(SCHEDULE)
+
+
+def test_a_certificate_of_one_set_of_gains_proves_no_schedule(
+    tmp_path: Path, certified: tuple[Gains, Certificate]
+) -> None:
+    table = certified[1].table(SCHEDULE, 1.0, {})
+    save_gains(tmp_path / "s.toml", replace(SCHEDULE, certificate=table), "hirm")
+    verification = verified(load_law(tmp_path / "s.toml"))
+    assert not verification.passed
+    assert verification.reason == ("a schedule cannot be verified: lyapunov certificates speak of one set of gains")
+    assert verified(SCHEDULE).reason == "there is no certificate"
+
+
+@pytest.mark.parametrize(
+    ("field", "value"), [("d_max", 3), ("d_min", 3), ("K1", [[1.0, 2.0, 3.0]]), ("K2", [[1.0, 2.0, 3.0]])]
+)
+def test_a_tampered_schedule_is_refused_by_name(
+    tmp_path: Path, certified: tuple[Gains, Certificate], field: str, value: object
+) -> None:
+    path = tmp_path / "s.toml"
+    longer = Schedule("s", HIRM.model, (LOW, replace(HIGH, d_max=4)))
+    save_gains(path, replace(longer, certificate=certified[1].table(longer, 1.0, {})), "hirm")
+    data = tomllib.loads(path.read_text())
+    data["window"][1][field] = value
+    complaint = tampered(path, "window", data["window"])
+    assert "certificate.sha256.gains: expected the hash of the windows and their K1 and K2" in complaint

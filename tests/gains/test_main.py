@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -10,7 +11,8 @@ from click.testing import CliRunner
 
 from gains.__main__ import cli
 from gains.certificate import claim_hash, gains_hash, model_hash
-from gains.store import load_gains, load_model, resolve
+from gains.model import Schedule
+from gains.store import Stored, load_gains, load_model, resolve, save_gains
 from gains.verify import verified
 
 ROOT = Path(__file__).parents[2]
@@ -87,7 +89,9 @@ def test_a_certificate_is_verified_before_it_is_shown_as_one(tmp_path: Path) -> 
 
 def test_certify_proves_writes_and_show_verifies(tmp_path: Path) -> None:
     path = tmp_path / "proved.toml"
-    result = process("certify", "hirm-paper", "--delay", "1:3", "--delta", "0.15", "--json", "-o", str(path))
+    result = process(
+        "certify", "hirm-paper", "--delay", "1:3", "--delta", "0.15", "--method", "lyapunov", "--json", "-o", str(path)
+    )
     assert result.returncode == 0
     answer = json.loads(result.stdout)
     assert list(answer) == [
@@ -107,7 +111,7 @@ def test_certify_proves_writes_and_show_verifies(tmp_path: Path) -> None:
 
 def test_certify_undecided_exits_1_and_writes_nothing(tmp_path: Path) -> None:
     path = tmp_path / "g.toml"
-    result = process("certify", "hirm-paper", "--json", "-o", str(path))
+    result = process("certify", "hirm-paper", "--method", "lyapunov", "--json", "-o", str(path))
     assert result.returncode == 1
     answer = json.loads(result.stdout)
     assert (answer["verdict"], answer["eta"], answer["margin"], answer["d_max"]) == ("undecided", None, None, 4)
@@ -120,7 +124,7 @@ def test_certify_undecided_exits_1_and_writes_nothing(tmp_path: Path) -> None:
 
 
 def test_bound_finds_the_largest_delay() -> None:
-    answer = json.loads(process("bound", "pendulum-paper", "--json").stdout)
+    answer = json.loads(process("bound", "pendulum-paper", "--method", "lyapunov", "--json").stdout)
     assert list(answer) == [
         "d_min", "d_max", "seconds_of_latency", "limit", "method", "transitions", "refuted", "seconds",
     ]  # fmt: skip
@@ -130,7 +134,7 @@ def test_bound_finds_the_largest_delay() -> None:
     assert answer["d_max"] == 7
     assert (answer["refuted"]["d_max"], answer["refuted"]["witness"]) == (8, [8])
     assert answer["refuted"]["growth_per_sample"] == pytest.approx(1.0087, abs=1e-4)
-    result = process("bound", "pendulum-paper", "--d-min", "6")
+    result = process("bound", "pendulum-paper", "--d-min", "6", "--method", "lyapunov")
     assert result.returncode == 1
     assert "none from 6" in result.stdout
 
@@ -140,7 +144,10 @@ def test_bound_finds_the_largest_delay() -> None:
     [
         (["certify", "hirm-paper", "--delay", "3"], "--delay: expected MIN:MAX in samples, such as 1:3, found '3'"),
         (["certify", "hirm-paper", "--delay", "3:1"], "--delay: expected MIN <= MAX <= 1000, found 3:1"),
-        (["certify", "hirm-paper", "--delay", "0:0"], "--delay: expected a window up to at least 1 sample, found 0:0"),
+        (
+            ["certify", "hirm-paper", "--delay", "0:0", "--method", "lyapunov"],
+            "--delay: expected a window up to at least 1 sample, found 0:0",
+        ),
         (["certify", "pendulum-paper", "--delta", "0.1"], "expected 0, as model pendulum has no [uncertainty]"),
         (["certify", "hirm"], "expected a gain file (model, K1), found a model file"),
         (["bound", "hirm-paper", "--d-min", "5", "--limit", "4"], "--limit: expected at least d_min (5), found 4"),
@@ -197,3 +204,44 @@ def test_success_exits_0_and_writes_nothing_to_stderr() -> None:
     assert result.returncode == 0
     assert result.stderr == ""
     assert json.loads(result.stdout)["name"] == "hirm"
+
+
+@pytest.fixture
+def schedule(tmp_path: Path) -> Path:
+    gains = load_gains("hirm-paper")
+    sets = replace(gains, d_max=2), replace(gains, d_min=2, K1=gains.K1 + 0.25)
+    save_gains(tmp_path / "two.toml", Schedule("two", gains.model, sets), "hirm")
+    return tmp_path / "two.toml"
+
+
+def test_a_schedule_is_shown_window_by_window(schedule: Path) -> None:
+    text = invoke("show", str(schedule))
+    for part in ("two: for hirm, delay 1 to 4 samples (25 to 100 ms), schedule of 2 sets", "certificate: none"):
+        assert part in text
+    for part in ("set 0: delay 1 to 2", "set 1: delay 2 to 4", "K1 alpha_rad", "-0.5054", "-0.2554", "K2 xr3"):
+        assert part in text
+
+
+def test_show_json_of_a_schedule_is_the_schedule(schedule: Path) -> None:
+    shown, gains = json.loads(invoke("show", str(schedule), "--json")), load_gains("hirm-paper")
+    K2 = None if gains.K2 is None else gains.K2.tolist()
+    assert shown == {
+        "kind": "schedule", "name": "two", "model": "hirm", "Ts": 0.025, "d_min": 1, "d_max": 4,
+        "window": [
+            {"d_min": 1, "d_max": 2, "K1": gains.K1.tolist(), "K2": K2},
+            {"d_min": 2, "d_max": 4, "K1": (gains.K1 + 0.25).tolist(), "K2": K2},
+        ],
+        "certificate": "none",
+    }  # fmt: skip
+
+
+def test_a_stored_schedule_is_listed(schedule: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("gains.__main__.stored", lambda: [Stored("two", "gains", schedule)])
+    assert "schedule of 2 sets" in " ".join(invoke("list").split())
+
+
+def test_lemma_1_needs_one_set_of_gains_and_refuses_a_schedule(schedule: Path) -> None:
+    result = process("bound", str(schedule), "--method", "lyapunov")
+    assert result.returncode == 2
+    complaint = "window: expected one set of gains (d_min, d_max, K1), found a schedule"
+    assert result.stderr == f"gains: error: {schedule}: {complaint}\n"

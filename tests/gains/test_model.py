@@ -1,12 +1,24 @@
 """Holds and closed loops against scipy, against an analytic case and against the printed numbers."""
 
 import pickle
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from scipy.signal import cont2discrete
 
-from gains.model import Actuator, Matrix, Model, Trim, read_only, spectral_radius, zero_order_hold
+from gains.model import (
+    Actuator,
+    Gains,
+    Matrix,
+    Model,
+    Schedule,
+    Trim,
+    read_only,
+    sets_of,
+    spectral_radius,
+    zero_order_hold,
+)
 from gains.store import load_gains, load_model
 
 
@@ -163,3 +175,46 @@ def test_gains_survive_pickling() -> None:
     gains = pickle.loads(pickle.dumps(load_gains("hirm-paper")))
     assert (gains.K1 == load_gains("hirm-paper").K1).all()
     assert gains.model.sensors["theta_rad"] == "ATTITUDE.pitch"
+
+
+HIRM = load_gains("hirm-paper")
+
+
+def with_windows(*windows: tuple[int, int]) -> tuple[Gains, ...]:
+    return tuple(replace(HIRM, name=f"s[{i}]", d_min=a, d_max=b) for i, (a, b) in enumerate(windows))
+
+
+def test_the_window_of_a_schedule_is_that_of_all_its_sets() -> None:
+    sets = with_windows((1, 3), (2, 5), (6, 9))
+    schedule = Schedule("s", HIRM.model, sets)
+    assert (schedule.d_min, schedule.d_max) == (1, 9)
+    assert sets_of(schedule) == sets
+    assert sets_of(HIRM) == (HIRM,)
+
+
+@pytest.mark.parametrize(
+    "windows",
+    [
+        [],
+        [(2, 5), (1, 3)],  # not in order
+        [(1, 3), (1, 3)],
+        [(1, 3), (1, 5)],  # one in the other
+        [(1, 5), (2, 5)],
+        [(1, 5), (2, 4)],
+        [(1, 3), (5, 6)],  # 4 left out
+    ],
+)
+def test_windows_out_of_order_inside_one_another_or_apart_assert(windows: list[tuple[int, int]]) -> None:
+    with pytest.raises(AssertionError):
+        Schedule("s", HIRM.model, with_windows(*windows))
+
+
+def test_sets_of_another_model_or_with_a_certificate_of_their_own_assert() -> None:
+    for odd in (replace(HIRM, model=replace(HIRM.model)), replace(HIRM, certificate={})):
+        with pytest.raises(AssertionError):
+            Schedule("s", HIRM.model, (odd,))
+
+
+def test_a_schedule_survives_pickling() -> None:
+    schedule = pickle.loads(pickle.dumps(Schedule("s", HIRM.model, with_windows((1, 2), (3, 4)))))
+    assert [(gains.d_min, gains.d_max) for gains in schedule.sets] == [(1, 2), (3, 4)]

@@ -13,15 +13,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gains.certificate import claim_hash, gains_hash, model_hash
-from gains.model import Gains, Model
+from gains.model import Gains, Model, Schedule, sets_of
 from gains.store import (
     DELAY_LIMIT,
     load,
     load_gains,
+    load_law,
     load_model,
     parse_gains,
+    parse_law,
     parse_model,
     resolve,
+    save_gains,
     stored,
 )
 from gains.table import InputError, Table
@@ -52,6 +55,15 @@ GAINS: dict[str, Any] = {
     "d_max": 4,
     "K1": [[1.0, 2.0, 3.0]],
     "K2": [[1.0, 2.0, 3.0]],
+}
+SCHEDULE: dict[str, Any] = {
+    "name": "s",
+    "model": "hirm",
+    "window": [
+        {"d_min": 1, "d_max": 3, "K1": [[1.0, 2.0, 3.0]], "K2": [[4.0, 5.0, 6.0]]},
+        {"d_min": 2, "d_max": 4, "K1": [[1.5, 2.0, 3.0]], "K2": [[4.5, 5.0, 6.0]]},
+        {"d_min": 5, "d_max": 6, "K1": [[1.7, 2.0, 3.0]], "K2": [[4.7, 5.0, 6.0]]},
+    ],
 }
 GONE = object()
 
@@ -206,8 +218,7 @@ GAINS_COMPLAINTS = [
     ("certificate", 1, "certificate: expected a table, found 1"),
     ("certficate", {}, "certficate: expected one of name, model, d_min, d_max, K1, K2, certificate, "
                        "found an unknown key; did you mean certificate?"),
-    ("window", [{}], "window: expected K1 and K2, found a schedule; "
-                     "schedules are not supported by this version"),
+    ("window", [{}], "window: expected one set of gains (d_min, d_max, K1), found a schedule"),
 ]  # fmt: skip
 
 
@@ -232,9 +243,88 @@ def test_a_certificate_is_kept_as_it_is() -> None:
     assert parse_gains(Table(GAINS, "f.toml")).certificate is None
 
 
-def test_a_schedule_is_refused_before_its_missing_gains() -> None:
-    data = {"name": "s", "model": "hirm", "window": [{"d_min": 1, "d_max": 2, "K1": [[1.0]]}]}
-    assert "schedules are not supported by this version" in complaint_of(parse_gains, data)
+def test_a_schedule_is_read_as_written() -> None:
+    schedule = parse_law(Table(SCHEDULE, "f.toml"))
+    assert isinstance(schedule, Schedule)
+    assert (schedule.name, schedule.model.name, schedule.d_min, schedule.d_max) == ("s", "hirm", 1, 6)
+    assert [(g.name, g.d_min, g.d_max) for g in schedule.sets] == [("s[0]", 1, 3), ("s[1]", 2, 4), ("s[2]", 5, 6)]
+    for gains, window in zip(schedule.sets, SCHEDULE["window"], strict=True):
+        assert gains.K2 is not None
+        assert (gains.K1.tolist(), gains.K2.tolist()) == (window["K1"], window["K2"])
+    assert schedule.certificate is None
+
+
+def test_a_schedule_without_a_reference_model_has_no_k2() -> None:
+    data = {"name": "s", "model": "pendulum", "window": [{"d_min": 1, "d_max": 2, "K1": [[1.0, 2.0]]}]}
+    law = parse_law(Table(data, "f.toml"))
+    assert [gains.K2 for gains in sets_of(law)] == [None]
+
+
+def windows(index: int, field: str, value: object) -> dict[str, Any]:
+    """The schedule with one field of one window set or removed."""
+    data = copy.deepcopy(SCHEDULE)
+    data["window"][index] = changed(data["window"][index], field, value)
+    return data
+
+
+SCHEDULE_COMPLAINTS = [
+    (windows(0, "d_min", GONE), "window[0].d_min: expected an integer from 0 to 1000, found nothing"),
+    (windows(0, "d_min", 4), "window[0].d_max: expected an integer from 4 to 1000, found 3"),
+    (windows(1, "d_max", 1001), "window[1].d_max: expected an integer from 2 to 1000, found 1001"),
+    (windows(1, "d_max", 3), "window[1].d_max: expected a number above 3, by the window before, found 3"),
+    (windows(2, "d_min", 6), "window[2].d_min: expected a number from 3 to 5, by the window before, found 6"),
+    (windows(2, "d_min", 2), "window[2].d_min: expected a number from 3 to 5, by the window before, found 2"),
+    (windows(2, "d_max", 5) | {"window": [*SCHEDULE["window"][::-1]]},
+     "window[1].d_min: expected a number from 6 to 7, by the window before, found 2"),
+    (SCHEDULE | {"window": [SCHEDULE["window"][0]] * 2},
+     "window[1].d_min: expected a number from 2 to 4, by the window before, found 1"),
+    (windows(0, "K1", [[1.0, 2.0]]), "window[0].K1: expected 3 columns, found 2"),
+    (windows(1, "K2", GONE), "window[1].K2: expected a matrix (an array of rows), found nothing"),
+    (windows(1, "K3", [[1.0]]), "window[1].K3: expected one of d_min, d_max, K1, K2, found an unknown key"),
+    (SCHEDULE | {"model": "pendulum"}, "window[0].K1: expected 2 columns, found 3"),
+    (SCHEDULE | {"window": []}, "window: expected at least one window, found none"),
+    (SCHEDULE | {"window": 3}, "window: expected an array of tables, found 3"),
+    (SCHEDULE | {"window": [1]}, "window[0]: expected a table, found 1"),
+    (SCHEDULE | {"K1": [[1.0, 2.0, 3.0]]}, "K1: expected one of name, model, window, certificate, "
+                                           "found an unknown key"),
+    (SCHEDULE | {"certificate": 1}, "certificate: expected a table, found 1"),
+    (changed(SCHEDULE, "name", GONE), "name: expected a string, found nothing"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("data", "complaint"), SCHEDULE_COMPLAINTS)
+def test_a_wrong_schedule_is_refused_in_one_exact_line(data: dict[str, Any], complaint: str) -> None:
+    assert complaint_of(parse_law, data) == f"f.toml: {complaint}"
+
+
+@pytest.mark.parametrize("data", [SCHEDULE, windows(0, "K1", GONE), SCHEDULE | {"window": 3}])
+def test_where_one_set_of_gains_is_wanted_a_schedule_is_refused_as_one(data: dict[str, Any]) -> None:
+    complaint = "window: expected one set of gains (d_min, d_max, K1), found a schedule"
+    assert complaint_of(parse_gains, data) == f"f.toml: {complaint}"
+
+
+def test_a_schedule_survives_its_file_bit_by_bit(tmp_path: Path) -> None:
+    schedule = parse_law(Table(windows(1, "K1", [[0.1 + 0.2, -1e-17, np.pi]]), "f.toml"))
+    save_gains(tmp_path / "s.toml", schedule, "hirm")
+    assert (tmp_path / "s.toml").read_text().count("[[window]]") == 3
+    back = load_law(tmp_path / "s.toml")
+    assert isinstance(back, Schedule)
+    assert isinstance(load(tmp_path / "s.toml"), Schedule)
+    assert (back.name, back.model.name, back.certificate) == ("s", "hirm", None)
+    for read, written in zip(back.sets, sets_of(schedule), strict=True):
+        assert (read.name, read.d_min, read.d_max) == (written.name, written.d_min, written.d_max)
+        np.testing.assert_array_equal(read.K1, written.K1)
+        np.testing.assert_array_equal(np.array(read.K2), np.array(written.K2))
+    with pytest.raises(InputError, match=r"s\.toml: window: expected one set of gains .*, found a schedule$"):
+        load_gains(tmp_path / "s.toml")
+
+
+def test_a_law_of_one_set_is_its_gains() -> None:
+    gains = load_law("hirm-paper")
+    assert isinstance(gains, Gains)
+    assert (gains.K1 == load_gains("hirm-paper").K1).all()
+    with pytest.raises(InputError, match=r"hirm\.toml: expected a gain file .*, found a model file$"):
+        load_law("hirm")
 
 
 def test_one_kind_of_file_is_not_the_other() -> None:
@@ -349,6 +439,25 @@ def test_any_value_in_any_field_of_a_model_is_taken_or_refused(field: str, value
     data = changed(changed(MODEL, "plant.continuous", continuous), field, value)
     with contextlib.suppress(InputError):
         assert np.isfinite(parse_model(Table(data, "f.toml")).A).all()
+
+
+@given(st.sampled_from([*SCHEDULE["window"][0], "K3"]), st.integers(0, 2), VALUES | MATRICES)
+def test_any_value_in_any_field_of_a_window_is_taken_or_refused(field: str, index: int, value: object) -> None:
+    with contextlib.suppress(InputError):
+        law = parse_law(Table(windows(index, field, value), "f.toml"))
+        assert isinstance(law, Schedule)
+
+
+@given(st.lists(st.tuples(st.integers(0, 9), st.integers(0, 9)), min_size=1, max_size=5))
+def test_windows_are_taken_just_when_they_rise_without_a_hole(bounds: list[tuple[int, int]]) -> None:
+    data = SCHEDULE | {"window": [SCHEDULE["window"][0] | {"d_min": a, "d_max": b} for a, b in bounds]}
+    delays = [set(range(a, b + 1)) for a, b in bounds]
+    nested = any(i != k and a <= b for i, a in enumerate(delays) for k, b in enumerate(delays))
+    covered = set().union(*delays)
+    hole = covered != set(range(min(covered, default=0), max(covered, default=-1) + 1))
+    fine = all(delays) and not nested and not hole and bounds == sorted(bounds)
+    with contextlib.nullcontext() if fine else pytest.raises(InputError):
+        assert [(g.d_min, g.d_max) for g in sets_of(parse_law(Table(data, "f.toml")))] == bounds
 
 
 @given(st.sampled_from([*GAINS, "certificate", "window"]), VALUES | MATRICES)

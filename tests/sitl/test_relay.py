@@ -11,7 +11,19 @@ from hypothesis import strategies as st
 
 from autopilot.link.node import Node
 from autopilot.link.topics import SCHEMAS
+from autopilot.link.wire import (
+    AUTOPILOT,
+    PLANT,
+    Attitude,
+    NamedValueInt,
+    ServoOutputRaw,
+    Timesync,
+    Wire,
+    autopilot_heartbeat,
+)
+from gains.witnessfile import Witness
 from sitl import relay as relay_module
+from sitl.gate import Gate
 from sitl.impairment import LinkSpec
 from sitl.linkspec import parse_spec
 from sitl.relay import MAX_QUEUED, Counters, RelayNode
@@ -19,6 +31,7 @@ from sitl.relay import MAX_QUEUED, Counters, RelayNode
 MS = 1_000_000
 S = 1_000_000_000
 PERFECT = LinkSpec()
+WITNESS = Witness("", "", 0.025, 1, 2, "fifo", 1.0, (2,))
 ENTRY = {"up": "plant", "down": "autopilot"}
 EXIT = {"up": "autopilot", "down": "plant"}
 
@@ -26,9 +39,9 @@ EXIT = {"up": "autopilot", "down": "plant"}
 class Flight:
     """A relay driven as the virtual driver does: jump to each deadline, deliveries before ticks."""
 
-    def __init__(self, up: str | LinkSpec, down: str | LinkSpec, seed: int = 1) -> None:
+    def __init__(self, up: str | LinkSpec, down: str | LinkSpec, seed: int = 1, gate: Gate | None = None) -> None:
         up, down = (parse_spec(spec) if isinstance(spec, str) else spec for spec in (up, down))
-        self.relay = RelayNode(up, down, seed)
+        self.relay = RelayNode(up, down, seed, gate)
         self.left: list[tuple[int, str, bytes]] = []
         self.records = []
 
@@ -91,7 +104,7 @@ arrivals = st.lists(st.tuples(short_times, st.sampled_from(["plant", "autopilot"
 
 def conserved(relay: RelayNode) -> bool:
     return all(
-        c.sent + c.duplicated == c.delivered + c.lost + c.refused + relay.queued[way]
+        c.sent + c.duplicated == c.delivered + c.lost + c.refused + c.gated + relay.queued[way]
         for way, c in relay.counters.items()
     )
 
@@ -139,6 +152,81 @@ def test_records_come_in_time_order_and_fit_their_schema(up, down, entries):
         assert body.keys() == set(SCHEMAS[record.topic]["required"])
         assert body["sent_ns"] <= record.t_ns
         assert body["delivered_ns"] == (record.t_ns if body["fate"] == "delivered" else None)
+
+
+@given(
+    up=link_specs,
+    down=link_specs,
+    delays=st.lists(st.integers(1, 6), min_size=1, max_size=8).map(tuple),
+    gaps=st.lists(st.tuples(st.booleans(), st.integers(0, 4)), max_size=60),
+)
+def test_with_a_gate_too_every_copy_is_accounted_for(up, down, delays, gaps):
+    flight = Flight(up, down, gate=Gate(Witness("", "", 0.025, 1, 6, "any", 1.0, delays)))
+    plant, autopilot = Wire(PLANT, AUTOPILOT), Wire(AUTOPILOT, PLANT)
+    k = now_ns = 0
+    for passes, number in gaps:
+        now_ns += number * 5 * MS
+        if passes:
+            k += 1
+            flight.send("plant", plant.encode(NamedValueInt(25 * k, "SAMPLE_K", k)), now_ns)
+            flight.send("plant", plant.encode(Attitude(25 * k, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)), now_ns)
+        else:
+            flight.send("autopilot", autopilot.encode(ServoOutputRaw(25_000 * (k - number) % 2**32, 1500)), now_ns)
+            flight.send("autopilot", autopilot.encode(Timesync(0, 5)), now_ns)
+        assert conserved(flight.relay)
+    flight.finish()
+    assert conserved(flight.relay)
+    counters = flight.relay.counters["down"]
+    fates = [record.body["fate"] for record in of(flight, "down")]
+    assert (fates.count("delivered"), fates.count("gated")) == (counters.delivered, counters.gated)
+    assert len([port for _, port, _ in flight.left if port == "plant"]) == counters.delivered
+    assert all(
+        record.body.keys() == SCHEMAS["link/down"]["properties"].keys() | {"delivered_ns"}
+        for record in of(flight, "down")
+    )
+    assert flight.relay.counters["up"].gated == 0
+
+
+def test_the_gate_leaves_other_packets_and_their_delay_alone():
+    plain, gated = (Flight("delay=3ms", "delay=7ms", gate=gate) for gate in (None, Gate(WITNESS)))
+    wire = Wire(AUTOPILOT, PLANT)
+    frames = [wire.encode(message) for message in (Timesync(0, 5), autopilot_heartbeat(tracking=True, degraded=False))]
+    for flight in (plain, gated):
+        for n, payload in enumerate([*frames, b"noise", b""]):
+            flight.send("autopilot", payload, n * MS)
+            flight.send("plant", payload, n * MS)
+        flight.finish()
+    assert gated.left == plain.left
+    assert gated.records == plain.records
+
+
+def test_a_command_leaves_when_the_gate_says_and_its_record_says_so():
+    flight = Flight(PERFECT, "delay=5ms", gate=Gate(WITNESS))
+    plant, autopilot = Wire(PLANT, AUTOPILOT), Wire(AUTOPILOT, PLANT)
+    first, second = (plant.encode(Attitude(25 * k, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)) for k in (0, 1))
+    command = autopilot.encode(ServoOutputRaw(0, 1500))
+    flight.send("plant", plant.encode(NamedValueInt(0, "SAMPLE_K", 0)) + first, 0)
+    flight.send("autopilot", command, 1 * MS)
+    flight.until(20 * MS)
+    assert flight.relay.queued == {"up": 0, "down": 1}
+    assert of(flight, "down") == []
+    flight.send("plant", second, 25 * MS)
+    assert flight.left[-2:] == [(25 * MS, "plant", command), (25 * MS, "autopilot", second)]
+    (record,) = of(flight, "down")
+    assert (record.body["sent_ns"], record.body["delivered_ns"]) == (1 * MS, 25 * MS)
+    assert flight.relay.queued == {"up": 0, "down": 0}
+
+
+def test_what_the_gate_missed_is_recorded_at_most_once_a_second():
+    flight = Flight(PERFECT, PERFECT, gate=Gate(WITNESS))
+    wire = Wire(PLANT, AUTOPILOT)
+    for k in range(200):
+        number = wire.encode(NamedValueInt(25 * k, "SAMPLE_K", k))
+        flight.send("plant", number + wire.encode(Attitude(25 * k, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)), 25 * k * MS)
+    events = [record for record in flight.records if record.topic == "events"]
+    assert [record.t_ns for record in events] == [n * S + 50 * MS for n in range(5)]
+    assert [record.body["data"] for record in events] == [{"gate": {"absent": 1 + 40 * n}} for n in range(5)]
+    assert all(record.body.keys() == SCHEMAS["events"]["properties"].keys() for record in events)
 
 
 # ---------------------------------------------------------------------------------------- the direction

@@ -1,0 +1,96 @@
+"""What a gain file holds beside its model's name: one set of gains, or the [[window]] tables of a schedule.
+
+:mod:`gains.store` finds the file and its model. The certificate of a schedule speaks of all switching between its
+sets; either kind is refused here when its model, its gains or the certificate itself have changed since the proof.
+"""
+
+from __future__ import annotations
+
+from gains.certificate import claim_hash, law_hash, model_hash
+from gains.model import GainLaw, Gains, Matrix, Model, Schedule
+from gains.table import Table
+
+__all__ = ["DELAY_LIMIT", "content_of", "read_gains", "read_schedule"]
+
+DELAY_LIMIT = 1000  # samples; buffers in the loop grow with d_max
+
+
+def read_gains(table: Table, name: str, model: Model) -> Gains:
+    """Return the one set of gains of a file, its certificate with it."""
+    d_min, d_max = _window(table)
+    K1, K2 = _matrices(table, model)
+    gains = Gains(name, model, d_min, d_max, K1, K2, table.mapping("certificate", None))
+    _check_hashes(table.source, gains, "K1 and K2")
+    return gains
+
+
+def read_schedule(table: Table, name: str, model: Model) -> Schedule:
+    """Return the schedule of a file, its certificate with it; windows rise, and leave no delay out."""
+    windows = table.tables("window")
+    if not windows:
+        raise table.error("window", "at least one window", "none")
+    sets: list[Gains] = []
+    for window in windows:
+        d_min, d_max = _window(window)
+        if sets:
+            before = sets[-1]
+            if not before.d_min < d_min <= before.d_max + 1:
+                low, high = before.d_min + 1, before.d_max + 1
+                raise window.error("d_min", f"a number from {low} to {high}, by the window before", str(d_min))
+            if d_max <= before.d_max:
+                raise window.error("d_max", f"a number above {before.d_max}, by the window before", str(d_max))
+        sets.append(Gains(f"{name}[{len(sets)}]", model, d_min, d_max, *_matrices(window, model)))
+    schedule = Schedule(name, model, tuple(sets), table.mapping("certificate", None))
+    _check_hashes(table.source, schedule, "the windows and their K1 and K2")
+    return schedule
+
+
+def content_of(law: GainLaw, model: str) -> dict[str, object]:
+    """Return what a gain file says, for writing: numbers at full double precision, the model by the name given."""
+    content: dict[str, object] = {"name": law.name, "model": model}
+    if isinstance(law, Schedule):
+        content["window"] = [_set_content(gains) for gains in law.sets]
+    else:
+        content |= _set_content(law)
+    if law.certificate is not None:
+        content["certificate"] = dict(law.certificate)
+    return content
+
+
+def _set_content(gains: Gains) -> dict[str, object]:
+    K2 = {} if gains.K2 is None else {"K2": gains.K2.tolist()}
+    return {"d_min": gains.d_min, "d_max": gains.d_max, "K1": gains.K1.tolist(), **K2}
+
+
+def _window(table: Table) -> tuple[int, int]:
+    d_min = table.integer("d_min", low=0, high=DELAY_LIMIT)
+    return d_min, table.integer("d_max", low=d_min, high=DELAY_LIMIT)
+
+
+def _matrices(table: Table, model: Model) -> tuple[Matrix, Matrix | None]:
+    """Return K1 and K2."""
+    K1 = table.matrix("K1", shape=(model.nu, model.nx))
+    if model.reference is not None:
+        return K1, table.matrix("K2", shape=(model.nu, model.nr))
+    if "K2" in table:
+        raise table.error("K2", f"none, as model {model.name} has no [reference]", "one")
+    return K1, None
+
+
+def _check_hashes(source: str, law: GainLaw, gains: str) -> None:
+    """Refuse a certificate that was made for another model or other gains, or that has been changed."""
+    certificate = law.certificate
+    if certificate is None:
+        return
+    hashes = Table(certificate, source, "certificate").table("sha256")
+    actual_hashes = {
+        "model": (f"model {law.model.name}", model_hash(law.model)),
+        "gains": (gains, law_hash(law)),
+        "certificate": ("the certificate", claim_hash(certificate)),
+    }
+    for key, (what, actual) in actual_hashes.items():
+        expected = hashes.string(key)
+        if expected != actual:
+            raise hashes.error(
+                key, f"the hash of {what}, {actual[:12]}…", f"{expected[:12]}…: made for another, or changed"
+            )

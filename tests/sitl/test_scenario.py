@@ -1,0 +1,99 @@
+"""Scenarios that replay a witness: what their files say, and what is refused before anything flies."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from gains.table import InputError
+from gains.witnessfile import Witness, read_witness, write_witness
+from sitl.scenario import Scenario, autopilot_arguments, load_scenario, plant_arguments, relay_arguments
+
+FIFO = Witness("hirm-paper", "hirm", 0.025, 1, 3, "fifo", 1.01, (1, 2, 3))
+ANY = Witness("hirm-paper", "hirm", 0.025, 1, 3, "any", 1.01, (1, 3))
+TEXT = """
+title = "a witness"
+gains = "hirm-paper"
+plant = "hirm"
+duration_s = 1.0
+{top}
+[link]
+witness = "w.csv"
+{rest}
+"""
+
+
+def load(folder: Path, witness: Witness = FIFO, top: str = "", rest: str = "") -> Scenario:
+    write_witness(folder / "w.csv", witness)
+    (folder / "s.toml").write_text(TEXT.format(top=top, rest=rest))
+    return load_scenario(str(folder / "s.toml"))
+
+
+def test_the_witness_is_looked_for_beside_the_scenario_and_goes_to_the_relay(tmp_path: Path) -> None:
+    scenario = load(tmp_path)
+    assert scenario.witness == FIFO
+    arguments = relay_arguments(scenario)
+    assert read_witness(arguments[arguments.index("--witness") + 1]) == FIFO
+    assert "--witness" not in relay_arguments(load_scenario("nominal"))
+
+
+def test_actuator_failsafe_and_latch_go_to_the_programs(tmp_path: Path) -> None:
+    scenario = load(tmp_path, ANY, 'actuator = "float"\nfailsafe = "monitor"\nlatch = "last"')
+    assert "--actuator float --failsafe monitor" in " ".join(autopilot_arguments(scenario))
+    assert "--latch last" in " ".join(plant_arguments(scenario))
+    plain = load(tmp_path)
+    assert (plain.actuator, plain.failsafe, plain.latch) == ("pwm", "on", "newest")
+
+
+def test_a_variant_changes_what_its_table_says_and_nothing_else(tmp_path: Path) -> None:
+    rest = '[variant.watched]\nfailsafe = "on"\n[variant.loose]\nservo_timeout = 0\n[variant.same]\n'
+    scenario = load(tmp_path, top='failsafe = "monitor"\nservo_timeout = 20', rest=rest)
+    found = {name: (v.failsafe, v.servo_timeout, v.witness) for name, v in scenario.variants.items()}
+    assert found == {"watched": ("on", 20, FIFO), "loose": ("monitor", None, FIFO), "same": ("monitor", 20, FIFO)}
+
+
+def test_the_servo_time_out_outlasts_the_longest_delay_of_the_witness(tmp_path: Path) -> None:
+    assert load(tmp_path).servo_timeout == 4 + 5
+    assert load(tmp_path, Witness("", "", 0.025, 1, 30, "fifo", 1.01, (1, 2))).servo_timeout == 30 + 5
+
+
+@pytest.mark.parametrize(
+    ("witness", "top", "rest", "complaint"),
+    [
+        (ANY, "", "", 'transitions: expected fifo for a plant that latches the newest .* latch = "last"'),
+        (Witness("", "", 0.03, 1, 3, "fifo", 1.01, (1,)), "", "", "Ts_s: expected 0.025 as that of hirm, found 0.03"),
+        (Witness("", "", 0.025, 0, 3, "fifo", 1.01, (1,)), "", "", "d_min: expected at least 1"),
+        (FIFO, 'latch = "oldest"', "", "latch: expected one of newest, last"),
+        (FIFO, 'actuator = "analog"', "", "actuator: expected one of pwm, float"),
+        (FIFO, 'failsafe = "off"', "", "failsafe: expected one of on, monitor"),
+        (FIFO, "", '[variant.v]\nfailsafe = "off"', "variant.v.failsafe: expected one of on, monitor"),
+        (FIFO, "", '[[check]]\nname = "n"\nmetric = "witness.missmatches"\nat_most = 0', "such as witness.mismatches"),
+    ],
+)
+def test_what_cannot_work_is_refused(tmp_path: Path, witness: Witness, top: str, rest: str, complaint: str) -> None:
+    with pytest.raises(InputError, match=complaint):
+        load(tmp_path, witness, top, rest)
+
+
+def test_a_witness_file_that_is_not_there_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "s.toml").write_text(TEXT.format(top="", rest=""))
+    with pytest.raises(InputError, match=r"w\.csv: expected a witness file, found nothing of that name"):
+        load_scenario(str(tmp_path / "s.toml"))
+
+
+def test_a_check_of_the_witness_needs_a_witness(tmp_path: Path) -> None:
+    text = TEXT.format(top="", rest='[[check]]\nname = "n"\nmetric = "witness.mismatches"\nat_most = 0')
+    (tmp_path / "s.toml").write_text(text.replace('witness = "w.csv"', ""))
+    with pytest.raises(InputError, match="metric: expected a number of the summary"):
+        load_scenario(str(tmp_path / "s.toml"))
+
+
+@pytest.mark.parametrize("name", ["witness", "witness-pendulum"])
+def test_the_stored_witnesses_are_of_the_gains_and_the_model_they_fly_with(name: str) -> None:
+    scenario = load_scenario(name)
+    assert scenario.witness is not None
+    assert (scenario.witness.gains, scenario.witness.model) == (scenario.gains.name, scenario.plant.name)
+    assert scenario.plant_name == scenario.gains.model.name
+    assert scenario.witness.d_max == scenario.gains.d_max + 1
+    assert scenario.witness.growth_per_sample > 1.0
