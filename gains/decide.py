@@ -15,7 +15,7 @@ import numpy as np
 
 from gains.definite import Verification
 from gains.exact import stability
-from gains.model import GainLaw, Matrix, sets_of
+from gains.model import GainLaw, Matrix, Schedule, sets_of
 from gains.stability import Budget, Stability, steps
 from gains.switched import Graph, Key, Switched, Transitions, eq9, factor, graph
 from gains.switched_certificate import SwitchedCertificate
@@ -169,7 +169,7 @@ def bound(
         Called with a line for each decision.
     """
     say = tell or (lambda _text: None)
-    low = max([d_min, *(own.d_min for own in sets_of(law)[1:])])  # a schedule's windows all take part
+    low = max(d_min, law.d_max) if isinstance(law, Schedule) else d_min  # a schedule's windows all take part
     refuted: Decision | None = None
     undecided: list[Decision] = []
     top = limit

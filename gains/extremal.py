@@ -23,6 +23,7 @@ from gains.model import Matrix
 __all__ = ["Tree", "grow", "in_forms", "subset_graph"]
 
 MARGIN = 1e-9  # a product is pruned below 1 − MARGIN, so that rounding cannot bring it back in verification
+_DEEPEST = 2000  # samples after which a product that has not contracted is given up
 _BATCH = 1 << 18  # entries of the products that are grown at once
 _SQUARINGS = 4
 
@@ -76,7 +77,7 @@ def subset_graph(edges: NDArray[np.intp]) -> NDArray[np.intp]:
 
 
 def grow(F: Matrix, edges: NDArray[np.intp], P: Matrix, limit: int, gamma: float = 1.0) -> Tree:
-    """Grow the products of F/γ, pruning in the norms of P, until none is left or ``limit`` products are grown.
+    """Grow the products of F/γ, pruning in the norms of P, until none is left or ``limit`` is reached.
 
     Parameters
     ----------
@@ -86,6 +87,7 @@ def grow(F: Matrix, edges: NDArray[np.intp], P: Matrix, limit: int, gamma: float
     P : ndarray, shape (1 or nodes, n, n)
         P ≻ 0: one for all nodes, or one for each.
     limit : int
+        Products grown at most, but for those of the last batch.
     gamma : float
     """
     n = F.shape[1]
@@ -98,7 +100,7 @@ def grow(F: Matrix, edges: NDArray[np.intp], P: Matrix, limit: int, gamma: float
     stack = [(np.repeat(np.eye(n)[None], len(starts), axis=0), starts, 0)]
     products, deepest, upper = 0, 0, 0.0
     while stack:
-        if products >= limit:
+        if products >= limit or deepest >= _DEEPEST:
             return Tree(False, math.inf, products, deepest)
         parents, at, depth = stack.pop()
         if len(parents) > batch:

@@ -30,6 +30,7 @@ _EPS = float(np.finfo(float).eps)
 _ON_CIRCLE = 1e-6  # of the pencil's eigenvalues: a false one costs one evaluation
 _GRID = 24
 _LEVELS = 30  # the level sets converge quadratically: 3 to 6 are used
+_TIMES = (4, 8, 12)  # how often a mode stands in a start of two blocks
 _AT_ONCE = 1 << 19  # numbers in one batch of responses
 
 
@@ -39,11 +40,12 @@ class Ascent(NamedTuple):
     Attributes
     ----------
     exhaustive, most : int
-        All cycles up to the first length are screened, as long as there are no more than the second.
+        All cycles up to the first length are screened, as long as there are no more than the second of one length.
     drawn : int
         Cycles drawn by the weights of the edges.
     kept, rounds : int
-        How many of the best are changed, and the most improvements of one.
+        How many of the best, each of another length, and how many of those given or drawn are changed, and the most
+        improvements of one.
     longest : int
         Longest cycle.
     frequencies : int
@@ -52,12 +54,12 @@ class Ascent(NamedTuple):
         Relative, of the norm.
     """
 
-    exhaustive: int = 3
+    exhaustive: int = 6
     most: int = 1000
     drawn: int = 64
-    kept: int = 3
+    kept: int = 6
     rounds: int = 30
-    longest: int = 24
+    longest: int = 32
     frequencies: int = 7
     tolerance: float = 1e-6
 
@@ -116,13 +118,16 @@ def worst_gain(
     """
     moves = Moves(switched.modes, successors(graph, len(switched.modes)))
     drawn = [] if weights is None else _drawn(graph, weights, effort, np.random.default_rng(seed))
-    batches = _shortest(moves, effort)
-    batches += [moves.admissible(np.array([cycle], dtype=np.intp)) for cycle in [*starts, *drawn]]
+    given = [moves.admissible(np.array([cycle], dtype=np.intp)) for cycle in [*starts, *drawn]]
     screen = np.linspace(0.0, np.pi, _GRID)
-    pool = {peak.cycle: peak for batch in batches for peak in _best(switched, batch, screen, effort.kept)}
-    ranked = sorted(pool.values(), key=lambda peak: (-peak.gain, peak.cycle))[: effort.kept]
+
+    def best_of(batches: Iterable[Cycles]) -> list[_Peak]:
+        return sorted(peak for cycles in batches for peak in _best(switched, cycles, screen, 1))
+
+    of_length = {len(peak.cycle): peak for peak in best_of([*_shortest(moves, effort), *_blocks(moves, effort)])}
+    ranked = [*sorted(of_length.values())[-effort.kept :], *best_of(given)[-effort.kept :]]
     passed: set[Cycle] = set()
-    best = max(_ascended(switched, moves, peak, effort, passed) for peak in ranked)
+    best = max(_ascended(switched, moves, peak, effort, passed) for peak in reversed(ranked))
     return best.gain, best.cycle
 
 
@@ -166,6 +171,13 @@ def _shortest(moves: Moves, effort: Ascent) -> list[Cycles]:
         once = every[every[:, 0] == every.min(axis=1)]  # of the rotations
         found.append(moves.admissible(once))
     return found
+
+
+def _blocks(moves: Moves, effort: Ascent) -> list[Cycles]:
+    """Return the cycles of one mode several times, then another: the slow modes answer to slow switching."""
+    modes = len(moves.allowed)
+    pairs = np.array([(i, j) for i in range(modes) for j in range(i)], dtype=np.intp).reshape(-1, 2)[: effort.most]
+    return [moves.repaired(np.repeat(pairs, times, axis=1)) for times in _TIMES if 2 * times <= effort.longest]
 
 
 def _drawn(graph: Graph, weights: Matrix, effort: Ascent, rng: np.random.Generator) -> list[Cycle]:
@@ -234,6 +246,8 @@ def _gains(lifted: _Lifted, theta: Matrix, above: float = 0.0) -> Matrix:
     """Return the largest singular value of T(e^{jθ}), shape (cycles, angles); 0 where it cannot be above ``above``."""
     T = _response(lifted, theta)
     largest = np.zeros(T.shape[:2])
+    if 0 in T.shape:
+        return largest
     flat = T if T.shape[2] <= T.shape[3] else T.swapaxes(2, 3)
     squared = flat @ flat.conj().swapaxes(2, 3)
     may = np.linalg.norm(squared, axis=(2, 3)) > above**2  # ‖T‖⁴ is no more than the sum of all eigenvalues squared

@@ -66,6 +66,10 @@ def certify(
     d_min, d_max = (law.d_min, law.d_max) if delay is None else parse_window(delay)
     if delta > 0.0 and law.model.uncertainty is None:
         raise InputError(f"--delta: expected 0, as model {law.model.name} has no [uncertainty], found {delta:g}")
+    if isinstance(law, Schedule) and not (d_min <= law.d_min and law.d_max <= d_max):
+        raise InputError(
+            f"--delay: expected a window around {law.d_min}:{law.d_max}, the schedule's, found {d_min}:{d_max}"
+        )
     if method == "exact":
         from gains.deciding import Question, run_certify  # with the solver: listing and showing do without
 
@@ -137,6 +141,10 @@ def bound(name: str, d_min: int, limit: int, method: str, transitions: Transitio
     law = load_law(name)
     if limit < d_min:
         raise InputError(f"--limit: expected at least d_min ({d_min}), found {limit}")
+    if isinstance(law, Schedule) and not d_min <= law.d_min <= law.d_max <= limit:
+        raise InputError(
+            f"--limit: expected delays around {law.d_min} to {law.d_max}, the schedule's, found {d_min} to {limit}"
+        )
     if method == "exact":
         from gains.deciding import run_bound
 

@@ -249,7 +249,8 @@ class _Search:
         self.blocks: dict[int, Block] = {}
         self.uppers = [math.inf] * len(self.parts)
         self.memory = self.products = self.solves = 0
-        self.hopeless = any(_diverges(part) for part in self.parts)
+        self.radii = [_largest_radius(part) for part in self.parts]
+        self.hopeless = max(self.radii) >= 1.0
 
     def found(self) -> Stability:
         """Return the state of the search."""
@@ -312,7 +313,7 @@ class _Search:
 
     def tighten(self) -> None:
         for i, part in self._open():
-            upper, spent = tighten(part, self.forms[i], self.budget.products)
+            upper, spent = tighten(part, self.forms[i], self.budget.products, max(1.0, self.radii[i]))
             self.uppers[i] = min(self.uppers[i], upper)
             self.products += spent
 
@@ -323,10 +324,10 @@ class _Search:
                 yield i, part
 
 
-def _diverges(part: Part) -> bool:
-    """Whether a matrix that can repeat without end is not Schur: then there is no proof to look for."""
+def _largest_radius(part: Part) -> float:
+    """Return the largest spectral radius of a matrix that can repeat without end: from 1 on there is no proof."""
     node, after, a = part.edges.T
-    return any(spectral_radius(part.F[i]) >= 1.0 for i in np.unique(a[node == after]))
+    return max((spectral_radius(part.F[i]) for i in np.unique(a[node == after])), default=0.0)
 
 
 def _majorant(law: GainLaw) -> Matrix:

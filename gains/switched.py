@@ -126,17 +126,19 @@ def factor(K1: Matrix) -> tuple[Matrix, Matrix]:
     K1 : ndarray, shape (rows, nx)
     """
     rows, nx = K1.shape
-    rank = int(np.linalg.matrix_rank(K1))
+    size = np.linalg.norm(K1, axis=1, keepdims=True)
+    unit = K1 / np.where(size > 0.0, size, 1.0)  # a row's rank does not depend on its length
+    rank = int(np.linalg.matrix_rank(unit))
     if rank == rows:
         return np.eye(rows), K1.copy()
     if rank == nx:
         return K1.copy(), np.eye(nx)
-    _, _, order = qr(K1.T, mode="economic", pivoting=True)
+    _, _, order = qr(unit.T, mode="economic", pivoting=True)
     chosen = np.sort(order[:rank])
-    R = K1[chosen]
-    L = np.asarray(np.linalg.lstsq(R.T, K1.T, rcond=None)[0].T, dtype=np.float64)
+    L = np.asarray(np.linalg.lstsq(unit[chosen].T, unit.T, rcond=None)[0].T, dtype=np.float64)
+    L = L * size / size[chosen].T if rank else L
     L[chosen] = np.eye(rank)
-    return L, R
+    return L, K1[chosen]
 
 
 def eq9(law: GainLaw, d_min: int, d_max: int, delta_max: float = 0.0) -> Switched:

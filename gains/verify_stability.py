@@ -18,10 +18,13 @@ from gains.definite import EPS, LEAST, MOST, UNDERFLOW, Verification, definite, 
 from gains.model import GainLaw, Matrix, sets_of
 from gains.switched_certificate import Block
 
-__all__ = ["MAX_PRODUCTS", "MAX_SETS", "check_blocks", "check_contraction"]
+__all__ = ["MAX_DEPTH", "MAX_PRODUCTS", "MAX_SETS", "check_blocks", "check_contraction"]
 
 MAX_PRODUCTS = 2_000_000
 """Products that a tree may grow to in verification."""
+
+MAX_DEPTH = 4000
+"""Samples of the longest product of such a tree."""
 
 MAX_SETS = 4096
 """Sets of nodes that a graph may lead to."""
@@ -135,11 +138,8 @@ def _falls(F: Matrix, error: Matrix, P: Matrix, after: Matrix) -> Verification:
     return definite((matrix + matrix.T) / 2, 1.01 * bound + UNDERFLOW, "a quadratic form does not fall in every sample")
 
 
-# -- the tree
-
-
 class _Steps(NamedTuple):
-    """The matrices of the edges between the coordinates of the norms, bounds on the 2-norms and on those of the errors."""
+    """The matrix of each edge, from norm to norm, and bounds on its 2-norm and on that of its error."""
 
     edges: NDArray[np.intp]
     X: Matrix
@@ -148,14 +148,15 @@ class _Steps(NamedTuple):
 
 
 class _Products(NamedTuple):
-    """Products Π, bounds on the 2-norms of their errors, and the nodes they have reached."""
+    """Products Π, bounds on the 2-norms of their errors, the nodes they have reached, and their length in samples."""
 
     X: Matrix
     error: Matrix
     at: NDArray[np.intp]
+    length: int
 
     def part(self, which: slice | NDArray[np.bool_]) -> _Products:
-        return _Products(self.X[which], self.error[which], self.at[which])
+        return _Products(self.X[which], self.error[which], self.at[which], self.length)
 
 
 def _tree(F: Matrix, error: Matrix, edges: NDArray[np.intp], P: Matrix) -> Verification:
@@ -171,13 +172,13 @@ def _tree(F: Matrix, error: Matrix, edges: NDArray[np.intp], P: Matrix) -> Verif
         read = _subsets(edges)
         if read is None:
             return failed("the graph leads to more sets of nodes than can be kept")
-        edges, starts, P = read, np.zeros(1, dtype=np.intp), np.repeat(P, len(read), axis=0)
+        edges, starts, P = read, np.zeros(1, dtype=np.intp), np.repeat(P, int(read[:, :2].max()) + 1, axis=0)
     steps = _in_norms(F[first], error[first], edges, P)
     if steps is None:
         return failed("a norm is too far from well conditioned")
     n = F.shape[1]
     batch = max(1, _BATCH // (len(edges) * n * n))
-    stack = [_Products(np.repeat(np.eye(n)[None], len(starts), axis=0), np.zeros(len(starts)), starts)]
+    stack = [_Products(np.repeat(np.eye(n)[None], len(starts), axis=0), np.zeros(len(starts)), starts, 0)]
     count, worst = 0, Verification(True, 1.0, 0.0, "")
     while stack:
         top = stack.pop()
@@ -185,7 +186,8 @@ def _tree(F: Matrix, error: Matrix, edges: NDArray[np.intp], P: Matrix) -> Verif
             stack.append(top.part(slice(0, -batch)))
         grown = _grown(steps, top.part(slice(-batch, None)))
         count += len(grown.X)
-        if count > MAX_PRODUCTS or not (np.isfinite(grown.X).all() and np.isfinite(grown.error).all()):
+        usable = np.isfinite(grown.X).all() and np.isfinite(grown.error).all()
+        if count > MAX_PRODUCTS or top.length >= MAX_DEPTH or not usable:
             return failed("the tree of products does not end")
         norm = _norms(grown)
         short = norm + grown.error < 1.0
@@ -208,7 +210,8 @@ def _grown(steps: _Steps, products: _Products) -> _Products:
         rounding = (error + (n + 2) * EPS * np.linalg.norm(X)) * size[here]
         longer = 1.001 * rounding + norm * products.error[here] * (1.0 + 8 * EPS) + UNDERFLOW
         parts.append((X @ products.X[here], longer, np.full(len(longer), after)))
-    return _Products(*(np.concatenate(part) for part in zip(*parts, strict=True)))
+    grown, bounds, at = (np.concatenate(part) for part in zip(*parts, strict=True))
+    return _Products(grown, bounds, at, products.length + 1)
 
 
 def _in_norms(F: Matrix, error: Matrix, edges: NDArray[np.intp], P: Matrix) -> _Steps | None:

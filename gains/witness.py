@@ -109,14 +109,14 @@ def find_witness(
         Of the random starts of the trajectories.
     """
     loop = state_loop(switched)
-    kept = _one_of_each(loop.modes)
-    number = {_key(loop.modes[i]): n for n, i in enumerate(kept)}
+    keys = [Key(mode.d, mode.gain_set) for mode in loop.modes]
+    kept = [keys.index(key) for key in dict.fromkeys(keys)]  # how far xr is predicted does not touch x and the slots
     modes = [loop.modes[i] for i in kept]
     moves = Moves(modes, successors(graph, len(loop.modes))[np.ix_(kept, kept)])
     search = _Search(_in_norm(loop.F[kept], P), moves, modes, effort)
     search.offer(moves.admissible(np.arange(len(kept))[:, None]))
     for start in starts:
-        given = [number[_key(loop.modes[i])] for i in start]
+        given = [kept.index(keys.index(keys[i])) for i in start]
         search.offer(moves.admissible(np.array([given], dtype=np.intp)))
     steps: list[Callable[[], None]] = [
         lambda: search.structured(wide=False),
@@ -129,8 +129,8 @@ def find_witness(
         if polish or search.growth <= 1.0 + _EDGE:
             step()
     assert search.best, "a delay can follow itself"
-    found = primitive([kept[i] for i in search.best[0][1]])
-    return Found(found, tuple(switched.modes[i].d for i in found), search.growth, search.products)
+    best = primitive([kept[i] for i in search.best[0][1]])
+    return Found(best, tuple(switched.modes[i].d for i in best), search.growth, search.products)
 
 
 def confirm(law: GainLaw, sequence: Sequence[int | Key], digits: int = 50) -> float:
@@ -145,7 +145,7 @@ def confirm(law: GainLaw, sequence: Sequence[int | Key], digits: int = 50) -> fl
     ----------
     law : Gains or Schedule
     sequence : sequence of int or Key
-        One period: d(0), …, d(L−1), or with the gain set of each command, of a schedule.
+        One period: d(0), …, d(L−1); of a schedule, with the gain set of each command.
     digits : int
         Decimal digits carried.
     """
@@ -355,18 +355,6 @@ def _wide(low: int, high: int) -> Iterator[list[int]]:
             for a in _COARSE:
                 for b in (1, 2, 3):
                     yield [bottom] * b + list(range(bottom + 1, top)) + [top] * a
-
-
-def _key(mode: Mode) -> Key:
-    return Key(mode.d, mode.gain_set)
-
-
-def _one_of_each(modes: Sequence[Mode]) -> list[int]:
-    """Return the first mode of each key: how far xr is predicted does not touch x and the slots."""
-    first: dict[Key, int] = {}
-    for i, mode in enumerate(modes):
-        first.setdefault(_key(mode), i)
-    return list(first.values())
 
 
 def _in_norm(F: Matrix, P: Matrix | None) -> Matrix:
