@@ -217,7 +217,7 @@ def prove_paths(part: Part, form: Quadratic, trials: int = 4) -> Quadratic | Non
 
 
 def tighten(part: Part, form: Quadratic, products: int, low: float = 1.0) -> tuple[float, int]:
-    """Return a bound on the growth below the rate of a quadratic form, by trees of F/γ, and the products spent.
+    """Return a bound on the growth below the rate of quadratic forms, by trees of F/γ, and the products spent.
 
     Parameters
     ----------
@@ -246,6 +246,7 @@ class _Search:
         self.switched, self.law, self.transitions, self.budget = switched, law, transitions, budget
         self.parts = parts_of(switched, graph(switched, law, transitions))
         self.forms: list[Quadratic] = []
+        self.tightest: dict[int, tuple[Part, Quadratic]] = {}
         self.blocks: dict[int, Block] = {}
         self.uppers = [math.inf] * len(self.parts)
         self.memory = self.products = self.solves = 0
@@ -269,6 +270,7 @@ class _Search:
             self.forms.append(form)
             self.solves += form.solves
             self.uppers[i] = form.rate
+            self.tightest[i] = part, form
             if form.rate < 1.0 - _EDGE:
                 self.blocks[i] = Block(part.states, "quadratic", 0, form.P)
 
@@ -304,6 +306,8 @@ class _Search:
             return None
         self.solves += several.solves
         self.uppers[i] = min(self.uppers[i], several.rate)
+        if several.rate < self.tightest[i][1].rate:
+            self.tightest[i] = part, several
         if several.rate < 1.0 - _EDGE:
             return Block(part.states, "paths", memory, several.P)
         tree = prove_tree(part, several.P, self.budget.products)
@@ -312,8 +316,8 @@ class _Search:
         return Block(part.states, "tree", memory, several.P) if tree.closed else None
 
     def tighten(self) -> None:
-        for i, part in self._open():
-            upper, spent = tighten(part, self.forms[i], self.budget.products, max(1.0, self.radii[i]))
+        for i, _ in self._open():
+            upper, spent = tighten(*self.tightest[i], self.budget.products, max(1.0, self.radii[i]))
             self.uppers[i] = min(self.uppers[i], upper)
             self.products += spent
 
