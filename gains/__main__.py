@@ -12,6 +12,7 @@ from rich.console import Console
 from rich.table import Table as Grid
 
 from gains.command import print_json, run, version
+from gains.frontier import frontier
 from gains.model import GainLaw, Gains, Matrix, Model, Schedule, sets_of
 from gains.proving import JSON_OPTION, bound, certify, design, schedule, witness
 from gains.store import load, load_law, load_model, stored
@@ -66,7 +67,7 @@ def show(name: str, as_json: bool) -> None:
         _show_law(_console(), item)
 
 
-for command in (certify, bound, witness, schedule, design):
+for command in (certify, bound, witness, schedule, design, frontier):
     cli.add_command(command)
 
 

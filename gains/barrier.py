@@ -4,9 +4,9 @@ For every transition i → j and the mode k taken there, with L = [M; H; J] of :
 
     S = diag(P_i, η² I, μ I) + τ I − M'P_jM − H'H − μ J'J ≻ 0.
 
-f = t·(η² or τ) − Σ log det S is convex for given gains. Its Newton system is assembled in closed form: X ↦ M X M' has the
-structure of a Kronecker product, so that a step costs one dense factorisation and no general-purpose solver comes near
-it. That the gains may vary with the rest gives, by a Schur complement, the exact gradient and Hessian of
+f = t·(η² or τ) − Σ log det S is convex for given gains. Its Newton system is assembled in closed form: X ↦ M X M' has
+the structure of a Kronecker product, so that a step costs little more than one dense factorisation. That the gains may
+vary with the rest gives, by a Schur complement, the exact gradient and Hessian of
 
     φ_t(θ) = min f / t,
 
@@ -16,6 +16,7 @@ a smooth function within (number of rows)/t of η²(θ).
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -123,7 +124,7 @@ class Barrier:
         if self.eta2 is not None:
             every = np.arange(S.shape[1])
             S[:, every, every] += at.cost
-        return S
+        return np.asarray(S, dtype=np.float64)
 
     def holds(self, at: Place) -> bool:
         """Whether every S is positive definite and the gains are inside their box."""
@@ -139,7 +140,7 @@ class Barrier:
         except np.linalg.LinAlgError:
             return float(np.inf)
         logs = 2.0 * float(np.sum(np.log(np.einsum("eii->ei", factors))))
-        return t * at.cost - logs - float(np.sum(np.log(room)))
+        return float(t * at.cost - logs - np.sum(np.log(room)))
 
     def _room(self, theta: Matrix) -> Matrix:
         """Return 1 − (K/box)² of every bounded entry."""
@@ -155,7 +156,10 @@ class Barrier:
         """
         gradient, hessian = self._system(at, t)
         k = len(gradient) - len(at.theta)
-        size = np.sqrt(np.maximum(np.diag(hessian)[:k], np.finfo(float).tiny))
+        diagonal = np.diag(hessian)[:k]
+        if not (np.all(np.isfinite(hessian)) and np.all(diagonal > 0.0)):
+            return None
+        size = np.sqrt(diagonal)
         normal = hessian[:k, :k] / size / size[:, None]
         for ridge in _RIDGES:
             try:
@@ -224,12 +228,12 @@ class Barrier:
         a, b, weight = self._packing()
         return np.asarray(weight * (matrices[..., a, b] + matrices[..., b, a]), dtype=np.float64)
 
-    def _squared(self, A: Matrix) -> Matrix:
-        """Return the packed operators X ↦ A X A' of a stack."""
-        a, b, weight = self._packing()
-        rows, other = A[:, a], A[:, b]
-        both = rows[:, :, a] * other[:, :, b] + rows[:, :, b] * other[:, :, a]
-        return np.asarray(2.0 * weight[:, None] * weight * both, dtype=np.float64)
+    def _congruences(self, A: Matrix) -> Matrix:
+        """Return the packed operator of X ↦ Σ A X A' over a stack."""
+        flat = A.reshape(len(A), -1)
+        products = (flat.T @ flat).reshape(-1)
+        straight, crossed, weight = _entries(self.family.N)
+        return np.asarray(weight * (products[straight] + products[crossed]), dtype=np.float64)
 
     def _parts(self, at: Place) -> _Parts:
         f = self.family
@@ -270,16 +274,17 @@ class Barrier:
         X, M = parts.X, parts.L[:, :N]
         XM = X @ np.swapaxes(M, 1, 2)
         own, target, cross = X[:, :N, :N], M @ XM, XM[:, :N]
-        squares = [self._squared(A) for A in (own, target, cross)]
-        firsts = self._packed(own), self._packed(target)
+        before, after, _ = self.edges.T
+        own_slope, target_slope = self._packed(own), self._packed(target)
+        for i in range(self.paths):
+            a = slice(i * width, (i + 1) * width)
+            hessian[a, a] += self._congruences(np.concatenate([own[before == i], target[after == i]]))
+            gradient[a] += np.sum(target_slope[after == i], axis=0) - np.sum(own_slope[before == i], axis=0)
         for e, (i, j, _) in enumerate(self.edges):
             a, b = slice(i * width, (i + 1) * width), slice(j * width, (j + 1) * width)
-            hessian[a, a] += squares[0][e]
-            hessian[b, b] += squares[1][e]
-            hessian[a, b] -= squares[2][e]
-            hessian[b, a] -= squares[2][e].T
-            gradient[a] -= firsts[0][e]
-            gradient[b] += firsts[1][e]
+            operator = self._congruences(cross[e : e + 1])
+            hessian[a, b] -= operator
+            hessian[b, a] -= operator.T
 
     def _slopes(self, at: Place, parts: _Parts) -> tuple[Matrix, Matrix]:
         """Return dS/d(cost, θ) and dL/dθ X, one stack for each edge."""
@@ -359,3 +364,13 @@ class Barrier:
         own = slice(len(gradient) - len(theta), None)
         gradient[own] += N.T @ (2.0 * ratio / room)
         hessian[own, own] += (N.T * (2.0 / room + 4.0 * ratio**2 / room**2)) @ N
+
+
+@lru_cache(maxsize=4)
+def _entries(N: int) -> tuple[NDArray[np.intp], NDArray[np.intp], Matrix]:
+    """Return where A_ac A_bd and A_ad A_bc stand in the flat Kronecker product of A, for packed entries ab and cd."""
+    a, b = np.triu_indices(N)
+    row, other = a[:, None] * N, b[:, None] * N
+    straight, crossed = (row + a) * N**2 + other + b, (row + b) * N**2 + other + a
+    weight = np.where(a == b, 0.5, 1.0)
+    return straight, crossed, 2.0 * weight[:, None] * weight

@@ -20,6 +20,7 @@ from gains.decide import Bound, Decision, bound, decide, refute
 from gains.exact import MAX_ROWS, ExactAnalysis, eta, program_rows
 from gains.lower_gain import worst_gain
 from gains.model import GainLaw, Gains, Schedule
+from gains.plotdata import margins, response
 from gains.proving import write_certified
 from gains.store import load_gains, model_path, resolve
 from gains.switched import Transitions, eq9, graph
@@ -112,26 +113,46 @@ def run_certify(question: Question, name: str, output: Path | None, *, as_json: 
     return SUCCESS if found.verdict == "stable" else NEGATIVE
 
 
-def run_bound(law: GainLaw, d_min: int, limit: int, transitions: Transitions, *, as_json: bool) -> int:
-    """Find the largest d_max by the exact method, print the answer and return the exit code."""
+def run_bound(
+    law: GainLaw, d_min: int, limit: int, transitions: Transitions, *, as_json: bool, plot: Path | None = None
+) -> int:
+    """Find the largest d_max by the exact method, print the answer, draw it and return the exit code.
+
+    Raises
+    ------
+    InputError
+        When the plot cannot be written.
+    """
     start = _clock()
     click.echo(f"gains: bounding the delay of {law.name} from {d_min} up to {limit}, method exact", err=True)
-    found = bound(law, d_min, limit, transitions, tell=lambda text: click.echo(f"gains: {text}", err=True))
+    found = bound(law, d_min, limit, transitions, tell=_tell)
     seconds = _clock() - start
+    if plot is not None:
+        from gains.plot import plot_margins  # with the plotting library: other answers do without
+
+        plot_margins(plot, margins(law, d_min, limit, transitions, found, _tell))
     if as_json:
-        print_json(_bound_json(law, d_min, limit, transitions, found, seconds))
+        print_json({**_bound_json(law, d_min, limit, transitions, found, seconds), "plot": plot})
     else:
         click.echo("\n".join(_bound_lines(law, d_min, limit, transitions, found)))
     return NEGATIVE if found.d_max is None else SUCCESS
 
 
-def run_witness(gains: Gains, window: tuple[int, int], transitions: Transitions, output: Path, *, as_json: bool) -> int:
-    """Find the witness of largest growth in a window, write it as CSV, print the answer and return the exit code.
+def run_witness(
+    gains: Gains,
+    window: tuple[int, int],
+    transitions: Transitions,
+    output: Path,
+    *,
+    as_json: bool,
+    plot: Path | None = None,
+) -> int:
+    """Find the witness of largest growth in a window, write it as CSV, draw the loop under it, return the exit code.
 
     Raises
     ------
     InputError
-        When the file cannot be written.
+        When a file cannot be written.
     """
     d_min, d_max = window
     start = _clock()
@@ -140,10 +161,13 @@ def run_witness(gains: Gains, window: tuple[int, int], transitions: Transitions,
     if found.witness is not None and found.growth is not None:
         model = gains.model
         text = Witness(gains.name, model.name, model.Ts, d_min, d_max, transitions, found.growth, found.witness)
-        try:
-            write_witness(output, text)
-        except OSError as error:
-            raise InputError(f"{output}: {error.strerror or error}") from None
+        write_witness(output, text)
+        if plot is not None:
+            from gains.plot import plot_response
+
+            plot_response(plot, response(gains, found, transitions))
+    elif plot is not None:
+        click.echo(f"gains: {plot} not written: there is no witness", err=True)
     if as_json:
         answer = {
             "verdict": found.verdict,
@@ -154,6 +178,7 @@ def run_witness(gains: Gains, window: tuple[int, int], transitions: Transitions,
             "growth_per_sample": found.growth,
             **_bounds_json(found),
             "file": None if found.witness is None else str(output),
+            "plot": None if found.witness is None else plot,
             "seconds": _clock() - start,
         }
         print_json(answer)
@@ -225,6 +250,10 @@ def _as_flown(question: Question) -> tuple[float | None, float | None]:
         analysis = eta(law, d_min, d_max, transitions=transitions, delta_max=delta_max, aheads=aheads)
         found.append(analysis.eta)
     return found[0], found[1]
+
+
+def _tell(text: str) -> None:
+    click.echo(f"gains: {text}", err=True)
 
 
 # -- answers

@@ -12,9 +12,10 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from gains.command import NEGATIVE, SUCCESS, print_json
-from gains.design import Bounds, Design, Method, SteadyState, Step, design
+from gains.design import Bounds, Design, Method, Search, SteadyState, Step, design
 from gains.proving import write_certified
 from gains.store import load_gains, load_model, resolve
+from gains.switched import Transitions
 from gains.table import InputError
 from gains.weighting import Weighting
 
@@ -37,8 +38,9 @@ def run_design(
     as_json : bool
         Whether standard output is one JSON object.
     options : dict
-        ``method``, ``transitions``, ``delta``, ``steady_state``, ``start``, ``iterations``, ``weight`` (pairs
-        of name and number) and ``limit`` (pairs of gain and number), as the command line gives them.
+        ``method``, ``search``, ``memory``, ``transitions``, ``delta``, ``steady_state``, ``start``,
+        ``iterations``, ``weight`` (pairs of name and number) and ``limit`` (pairs of gain and number), as the
+        command line gives them.
 
     Raises
     ------
@@ -50,7 +52,6 @@ def run_design(
     if not output.resolve().parent.is_dir():
         raise InputError(f"{output}: expected a folder to write to, found none at {output.resolve().parent}")
     begun = _clock()
-    method = cast(Method, "best" if options["method"] == "lyapunov" else options["method"])
     with _Reporter() as reporter:
         try:
             found = design(
@@ -59,7 +60,10 @@ def run_design(
                 delta_max=options["delta"],
                 steady_state=cast(SteadyState, options["steady_state"]),
                 start=start,
-                method=method,
+                method=cast(Method, options["method"]),
+                search=cast(Search, options["search"]),
+                transitions=cast(Transitions, options["transitions"]),
+                memory=options["memory"],
                 weights=_weighting(options["weight"]),
                 bounds=_bounds(options["limit"]),
                 progress=reporter.step,
@@ -153,6 +157,8 @@ def _answer(
         "d_min": window[0],
         "d_max": window[1],
         "method": options["method"],
+        "search": options["search"],
+        "memory": options["memory"],
         "transitions": options["transitions"],
         "steady_state": options["steady_state"],
         "delta_max": options["delta"],

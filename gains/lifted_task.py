@@ -1,4 +1,4 @@
-"""The design problem on the lifted form (section 5): the loop of Eq. (9) as an affine function of K, and η with its gradient.
+"""The design problem on the lifted form (section 5): the loop of Eq. (9), affine in K, and η with its gradient.
 
 The slots hold s = K1 x itself, one row for each input, so that every matrix of every mode is affine in K = [K1, K2].
 One mode's matrices stand in one stack
@@ -172,9 +172,7 @@ class LiftedTask:
         """
         given = self.given(K)
         answer = least_eta(self.loop(given), self.graph, self.tolerance)
-        usable = answer.status is Status.OPTIMAL or (
-            answer.status is Status.INACCURATE and answer.accuracy < _ROUGH
-        )
+        usable = answer.status is Status.OPTIMAL or (answer.status is Status.INACCURATE and answer.accuracy < _ROUGH)
         if not (usable and answer.value > 0.0):
             return None
         slope = self._slope(given, answer) * self.units.U[:, None] / self.units.T

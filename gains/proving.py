@@ -34,6 +34,24 @@ TRANSITIONS_OPTION = click.option(
 _clock = time.perf_counter  # noqa: TID251  # a command says how long it took
 
 
+def _writable(_context: click.Context, _option: click.Parameter, plot: Path | None) -> Path | None:
+    """Refuse a plot that cannot be written before anything is computed."""
+    if plot is not None:
+        from gains.plot import require_writable  # with the plotting library: most commands do without
+
+        require_writable(plot)
+    return plot
+
+
+PLOT_OPTION = click.option(
+    "--plot",
+    type=click.Path(path_type=Path),
+    callback=_writable,
+    metavar="FILE",
+    help="Draw the answer: a .png, .svg or .pdf file.",
+)
+
+
 @click.command()
 @click.argument("name", metavar="GAINS")
 @click.option("--delay", "delay", metavar="MIN:MAX", help="Window of delays in samples; default: the file's.")
@@ -131,12 +149,15 @@ def _certify_sufficient(
 @click.option("--limit", type=click.IntRange(1, DELAY_LIMIT), default=20, show_default=True)
 @click.option("--method", type=click.Choice(["exact", "lyapunov", "constant"]), default="exact", show_default=True)
 @TRANSITIONS_OPTION
+@PLOT_OPTION
 @JSON_OPTION
-def bound(name: str, d_min: int, limit: int, method: str, transitions: Transitions, as_json: bool) -> int:
+def bound(
+    name: str, d_min: int, limit: int, method: str, transitions: Transitions, plot: Path | None, as_json: bool
+) -> int:
     """Find the largest d_max up to a limit for which GAINS are proved stable on [d_min, d_max].
 
-    'exact' gives a proof at d_max and a delay sequence that breaks d_max + 1. 'lyapunov' is Lemma 1, a sufficient
-    condition; 'constant' is exact for delays that never change.
+    'exact' gives a proof at d_max and a delay sequence that breaks d_max + 1; --plot draws growth and gain against
+    the delay. 'lyapunov' is Lemma 1, a sufficient condition; 'constant' is exact for delays that never change.
     """
     law = load_law(name)
     if limit < d_min:
@@ -148,7 +169,9 @@ def bound(name: str, d_min: int, limit: int, method: str, transitions: Transitio
     if method == "exact":
         from gains.deciding import run_bound
 
-        return run_bound(law, d_min, limit, transitions, as_json=as_json)
+        return run_bound(law, d_min, limit, transitions, as_json=as_json, plot=plot)
+    if plot is not None:
+        raise InputError(f"--plot: expected method exact, found {method}")
     return _bound_sufficient(load_gains(name), d_min, limit, method, transitions, as_json=as_json)
 
 
@@ -192,17 +215,18 @@ def _bound_sufficient(gains: Gains, d_min: int, limit: int, method: str, transit
 @click.option("--delay", required=True, metavar="MIN:MAX", help="Window of delays in samples.")
 @TRANSITIONS_OPTION
 @click.option("-o", "--output", type=click.Path(dir_okay=False, path_type=Path), required=True, help="The CSV file.")
+@PLOT_OPTION
 @JSON_OPTION
-def witness(name: str, delay: str, transitions: Transitions, output: Path, as_json: bool) -> int:
+def witness(name: str, delay: str, transitions: Transitions, output: Path, plot: Path | None, as_json: bool) -> int:
     """Find a periodic delay sequence in a window under which GAINS diverge, and write it as CSV.
 
     The sequence of largest growth found is written; its growth is confirmed in multiple precision. 'sitl relay
-    --witness' and the scenarios 'witness' fly it.
+    --witness' and the scenarios 'witness' fly it. --plot draws the loop under it.
     """
     gains, window = load_gains(name), parse_window(delay)
     from gains.deciding import run_witness
 
-    return run_witness(gains, window, transitions, output, as_json=as_json)
+    return run_witness(gains, window, transitions, output, as_json=as_json, plot=plot)
 
 
 @click.command()
@@ -226,10 +250,24 @@ def schedule(names: tuple[str, ...], output: Path, transitions: Transitions, del
 @click.option("--delay", required=True, metavar="MIN:MAX", help="Window of delays in samples.")
 @click.option(
     "--method",
-    type=click.Choice(["lyapunov", "convexify", "quasi-newton", "ccl", "printed"]),
-    default="lyapunov",
+    type=click.Choice(["exact", "lyapunov", "ccl", "printed"]),
+    default="exact",
     show_default=True,
-    help="'lyapunov' is the best combination on Lemma 1.",
+    help="'exact' is the switched system itself, 'lyapunov' is Lemma 1.",
+)
+@click.option(
+    "--search",
+    type=click.Choice(["best", "quasi-newton", "convexify"]),
+    default="best",
+    show_default=True,
+    help="How 'exact' and 'lyapunov' look for gains.",
+)
+@click.option(
+    "--memory",
+    type=click.IntRange(0, 4),
+    default=0,
+    show_default=True,
+    help="Past delays that a storage of 'exact' knows: tighter and slower.",
 )
 @TRANSITIONS_OPTION
 @click.option("--delta", type=FiniteRange(min=0.0), default=0.0, help="Bound on the uncertainty; default 0: none.")

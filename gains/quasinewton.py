@@ -7,14 +7,14 @@ run through them. Gains without a finite η count as +∞, so a step never leave
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
 from gains.model import Matrix
-from gains.task import Gain, Task
+from gains.steady import Law
 
-__all__ = ["Iterate", "Point", "bfgs", "quasi_newton"]
+__all__ = ["Iterate", "Point", "Problem", "Progress", "Step", "bfgs", "quasi_newton"]
 
 _ARMIJO = 1e-4
 _CURVATURE = 0.5
@@ -32,6 +32,77 @@ class Iterate(NamedTuple):
     eta: float
 
 
+class Step(NamedTuple):
+    """One step of a design, as progress shows it and history keeps it.
+
+    Attributes
+    ----------
+    method : str
+        "start", "widen", or the method.
+    iteration : int
+        From 1 in each method.
+    share : float
+        1, or how far the delays are widened: then η is that of the easier problem.
+    eta : float
+        η, weighted; by the solver, not yet verified.
+    gains : ndarray, shape (nu, nx + nr)
+        [K1, K2].
+    """
+
+    method: str
+    iteration: int
+    share: float
+    eta: float
+    gains: Matrix
+
+
+Progress = Callable[[Step], None]
+
+
+class Slope(Protocol):
+    """η at some gains and d(log η)/dK̂."""
+
+    @property
+    def eta(self) -> float:
+        """η."""
+        ...
+
+    @property
+    def gradient(self) -> Matrix:
+        """d(log η)/dK̂, shape (nu, n)."""
+        ...
+
+
+class Problem(Protocol):
+    """What the descent asks of a design problem: :class:`gains.task.Task`, :class:`gains.lifted_task.LiftedTask`."""
+
+    @property
+    def law(self) -> Law:
+        """The affine subspace of K̂."""
+        ...
+
+    @property
+    def box(self) -> Matrix:
+        """Bounds on the entries of K̂."""
+        ...
+
+    def inside(self, K: Matrix) -> bool:
+        """Whether K̂ is strictly inside its box."""
+        ...
+
+    def free(self, K: Matrix) -> Matrix:
+        """Return the coordinates of K̂."""
+        ...
+
+    def point(self, theta: Matrix) -> Matrix:
+        """Return K̂ at the given coordinates."""
+        ...
+
+    def gain(self, K: Matrix) -> Slope | None:
+        """Return η and its gradient; None where η is not finite."""
+        ...
+
+
 class Point(NamedTuple):
     """A point of the descent: coordinates, value, gradient."""
 
@@ -43,14 +114,14 @@ class Point(NamedTuple):
 Function = Callable[[Matrix], "Point | None"]
 
 
-def quasi_newton(task: Task, K: Matrix, iterations: int, tolerance: float = 2e-6) -> Iterator[Iterate]:
+def quasi_newton(task: Problem, K: Matrix, iterations: int, tolerance: float = 2e-6) -> Iterator[Iterate]:
     """Yield gains of falling η, from gains inside the box whose η is finite.
 
     With a box, log η − κ Σ log(1 − (K/box)²) is minimised for falling κ; an iterate may then raise η.
 
     Parameters
     ----------
-    task : Task
+    task : Problem
     K : ndarray, shape (nu, n)
         Projected onto the task's affine subspace first.
     iterations : int
@@ -60,9 +131,9 @@ def quasi_newton(task: Task, K: Matrix, iterations: int, tolerance: float = 2e-6
     boxed = bool(np.any(np.isfinite(task.box)))
     theta = task.free(K)
     for barrier in _BARRIERS if boxed else (0.0,):
-        seen: dict[bytes, Gain] = {}
+        seen: dict[bytes, Slope] = {}
 
-        def function(x: Matrix, barrier: float = barrier, seen: dict[bytes, Gain] = seen) -> Point | None:
+        def function(x: Matrix, barrier: float = barrier, seen: dict[bytes, Slope] = seen) -> Point | None:
             K = task.point(x)
             found = task.gain(K) if task.inside(K) else None
             if found is None:

@@ -15,14 +15,18 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from gains.certificate import MAX_DELAY
 from gains.definite import EPS, LEAST, MOST, UNDERFLOW, Verification, definite, failed
 from gains.model import GainLaw, Gains, Matrix, sets_of
-from gains.switched_certificate import MAX_STORAGES, SwitchedCertificate
+from gains.switched_certificate import MAX_MEMORY, MAX_STORAGES, SwitchedCertificate
 from gains.verify_stability import check_blocks, check_contraction
 
 __all__ = ["check_switched", "least_eta_of"]
 
-_PRODUCT = 16  # a rank factorisation may differ from K1 by this many roundings of its product
+_ENTRIES = 1 << 24  # of all modes' maps together: what is larger is not a certificate but a load
+_AHEAD = 10_000  # samples: beyond it a prediction is none
+_PRODUCT = 16  # a rank factorisation may differ from K1 by this many roundings
+_CANCELLED = 1e3  # its terms may be that much larger than K1
 
 
 class _Key(NamedTuple):
@@ -49,6 +53,14 @@ def check_switched(law: GainLaw, certificate: SwitchedCertificate) -> Verificati
         return failed(unusable)
     if certificate.contraction is not None:
         return _worst([_schur(law), check_contraction(law, certificate.contraction)])
+    if _entries(law, certificate) > _ENTRIES:
+        return failed("the window or the predictions are too many to be computed with")
+    with np.errstate(over="ignore", invalid="ignore", under="ignore"):  # what is not finite does not pass
+        return _checked(law, certificate)
+
+
+def _checked(law: GainLaw, certificate: SwitchedCertificate) -> Verification:
+    """Check a certificate that makes sense, other than a contraction."""
     loop = _Loop(law, certificate)
     if loop.storages > MAX_STORAGES:
         return failed("there are more storages than a certificate may hold")
@@ -61,6 +73,8 @@ def check_switched(law: GainLaw, certificate: SwitchedCertificate) -> Verificati
         return failed(f"expected {shape[0]} storages of size {shape[1]}")
     if certificate.mu.shape != ((len(loop.edges),) if certificate.delta_max > 0.0 else (0,)):
         return failed("expected one multiplier for each transition")
+    if not np.array_equal(certificate.P, certificate.P.transpose(0, 2, 1)):
+        return failed("a storage is not symmetric")
     checks = [definite(P, np.zeros_like(P), "a storage is not positive definite") for P in certificate.P]
     checks += [_transition(loop, certificate, e) for e in range(len(loop.edges))]
     if certificate.eta is None:
@@ -97,8 +111,12 @@ def least_eta_of(law: GainLaw, certificate: SwitchedCertificate) -> float:
 def _unusable(law: GainLaw, certificate: SwitchedCertificate) -> str:
     """Return why a certificate makes no sense; empty if it does."""
     c = certificate
-    if not (0 <= c.d_min <= c.d_max):
-        return f"no window of delays: {c.d_min} to {c.d_max}"
+    if not (0 <= c.d_min <= c.d_max <= MAX_DELAY):
+        return f"no window of delays: {c.d_min} to {min(c.d_max, MAX_DELAY + 1)}"
+    if not 0 <= c.memory <= MAX_MEMORY or len(c.blocks) > MAX_STORAGES:
+        return "memory or blocks are out of range"
+    if c.aheads is not None and not (c.aheads and 0 <= min(c.aheads) <= max(c.aheads) <= _AHEAD):
+        return "the predictions are out of range"
     scalars = np.array([c.delta_max, c.eta or 0.0])
     numbers = [c.P.reshape(-1), c.mu, scalars, *(block.P.reshape(-1) for block in c.blocks)]
     if not all(np.isfinite(part).all() for part in numbers):
@@ -116,15 +134,33 @@ def _unusable(law: GainLaw, certificate: SwitchedCertificate) -> str:
     return ""
 
 
+def _entries(law: GainLaw, certificate: SwitchedCertificate) -> int:
+    """Return how many entries the maps of all modes have, at most, before any is built."""
+    c, sets = certificate, sets_of(law)
+    width = len(sets) * law.model.nu if c.right is None else max(len(c.right), 1)
+    size = law.model.nx + width * c.d_max + law.model.nr
+    return (c.d_max - c.d_min + 1) * len(sets) * len(c.aheads or (0,)) * size * size
+
+
 def _factors(law: GainLaw, certificate: SwitchedCertificate) -> bool:
-    """Whether K1 is the product of the factors, to within the rounding of the law itself; true where there are none."""
+    """Whether K1 is the product of the factors, to within the rounding of the law itself; true where there are none.
+
+    Rounding is reckoned by the scales of the rows and columns of K1, so that units do not matter; factors that are
+    far larger than their product cancel, and are none.
+    """
     left, right = certificate.left, certificate.right
     if left is None and right is None:
         return True
-    if left is None or right is None or left.shape[1] != right.shape[0]:
-        return False
     wanted = np.vstack([gains.K1 for gains in sets_of(law)])
-    return bool(np.all(np.abs(left @ right - wanted) <= _PRODUCT * EPS * (np.abs(left) @ np.abs(right))))
+    if left is None or right is None or (len(left), right.shape[1]) != wanted.shape or left.shape[1] != len(right):
+        return False
+    if not (np.abs(left).max(initial=0.0) < MOST and np.abs(right).max(initial=0.0) < MOST):
+        return False
+    columns = np.abs(wanted).max(axis=0)
+    rows = np.max(np.abs(wanted) / np.where(columns > 0.0, columns, 1.0), axis=1)
+    scale, size = rows[:, None] * columns, np.abs(left) @ np.abs(right)
+    close = np.abs(left @ right - wanted) <= _PRODUCT * EPS * (scale + size)
+    return bool(np.all(close & (size <= _CANCELLED * scale)))
 
 
 class _Loop:

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from rich.console import Console
 from rich.table import Table
 
-from tests.bench import certify, flight, turnaround
+from tests.bench import certify, design, exact, flight, turnaround
 
 
 @dataclass(frozen=True)
@@ -29,6 +29,8 @@ class Row:
 def main() -> int:
     benches: list[Callable[[], list[tuple[str, float, float, str]]]] = [
         certify.measure,
+        design.measure,
+        exact.measure,
         flight.measure,
         turnaround.measure,
     ]

@@ -1,4 +1,4 @@
-"""The inequalities of section 5 as they stand, on the lifting over all past states, stated in cvxpy with its defaults."""
+"""The inequalities of section 5 as they stand, on the lifting over all past states, in cvxpy with its defaults."""
 
 from __future__ import annotations
 
@@ -46,5 +46,3 @@ def _pairs(full: Switched, transitions: Transitions) -> list[tuple[int, int]]:
 
 def _symmetric(expression: cp.Expression) -> cp.Expression:
     return (expression + expression.T) / 2
-
-

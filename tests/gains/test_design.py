@@ -1,17 +1,19 @@
-"""Designs: what the methods reach, that each is proved, and that gradients and constraints hold."""
+"""Designs on Lemma 1: what the methods reach, that each is proved, and that gradients and constraints hold."""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from itertools import pairwise
 
 import numpy as np
 import pytest
 
+from gains import design as designs
 from gains import lyapunov
 from gains.ccl import complementarity, corrected
 from gains.convexify import convexification
-from gains.design import Bounds, Design, Step, design
+from gains.design import Bounds, Design, Step
 from gains.model import Gains, Model, Reference, Trim
 from gains.quasinewton import Point, bfgs
 from gains.start import feasible, lq_gains
@@ -20,6 +22,8 @@ from gains.store import load_gains, load_model
 from gains.task import Task, task
 from gains.verify import check
 from gains.weighting import Weighting, weighted
+
+design = partial(designs.design, method="lyapunov")
 
 HIRM = load_model("hirm")
 PAPER = load_gains("hirm-paper")
@@ -197,7 +201,16 @@ def test_more_outputs_than_inputs_are_tracked_in_least_squares_with_a_note() -> 
     [(0.0, "exact", 0.163), (0.0, "free", 0.159), (0.15, "exact", 0.200), (0.15, "free", 0.191)],
 )
 def test_quasi_newton_reaches_what_was_asked(delta_max, steady_state, asked, start) -> None:
-    found = design(HIRM, 1, 3, delta_max=delta_max, steady_state=steady_state, start=start, method="quasi-newton")
+    found = design(
+        HIRM,
+        1,
+        3,
+        delta_max=delta_max,
+        steady_state=steady_state,
+        start=start,
+        method="lyapunov",
+        search="quasi-newton",
+    )
     gains = assert_proved(found, HIRM, delta_max)
     assert found.eta <= asked
     assert steady_state == "free" or steady_error(gains) < 1e-9
@@ -226,7 +239,7 @@ def test_convexification_falls_monotonically(delta_max: float) -> None:
 @pytest.mark.long
 @pytest.mark.parametrize(("steady_state", "asked"), [("exact", 0.243), ("free", 0.218)])
 def test_convexification_alone_reaches_what_was_asked(steady_state, asked) -> None:
-    found = design(HIRM, 1, 3, method="convexify", start=PAPER, steady_state=steady_state)
+    found = design(HIRM, 1, 3, search="convexify", start=PAPER, steady_state=steady_state)
     assert_proved(found, HIRM)
     assert found.eta <= asked
 
@@ -270,14 +283,14 @@ def test_printed_theorem_designs_where_it_is_feasible() -> None:
 
 @pytest.mark.parametrize("d_max", [3, 6])
 def test_unstable_plant_is_stabilised_from_no_start(d_max: int) -> None:
-    found = design(PENDULUM, 1, d_max, method="quasi-newton", iterations=40)
+    found = design(PENDULUM, 1, d_max, search="quasi-newton", iterations=40)
     gains = assert_proved(found, PENDULUM)
     assert lyapunov.largest_constant_d(gains, 1, d_max).d_max == d_max
 
 
 def test_badly_scaled_states_reach_the_same_eta() -> None:
     model = in_other_units(HIRM, np.array([1.0, 1e3, 1e-3]))
-    found = design(model, 1, 3, delta_max=0.15, method="quasi-newton")
+    found = design(model, 1, 3, delta_max=0.15, search="quasi-newton")
     assert_proved(found, model, 0.15)
     assert found.eta <= 0.200
 
@@ -285,25 +298,25 @@ def test_badly_scaled_states_reach_the_same_eta() -> None:
 @pytest.mark.parametrize("radius", [0.9, 1.03])
 def test_several_inputs_and_outputs_with_feedthrough(radius: float) -> None:
     model = two_by_two(radius)
-    found = design(model, 1, 2, method="quasi-newton", iterations=15)
+    found = design(model, 1, 2, search="quasi-newton", iterations=15)
     assert steady_error(assert_proved(found, model)) < 1e-8
 
 
 def test_no_reference_model_needs_no_second_gain() -> None:
     model = replace(HIRM, reference=None)
-    found = design(model, 1, 3, method="quasi-newton", iterations=40)
+    found = design(model, 1, 3, search="quasi-newton", iterations=40)
     assert assert_proved(found, model).K2 is None
 
 
 @pytest.mark.parametrize("d", [1, 3])
 def test_constant_delay(d: int) -> None:
-    found = design(HIRM, d, d, method="quasi-newton", iterations=10)
+    found = design(HIRM, d, d, search="quasi-newton", iterations=10)
     assert_proved(found, HIRM)
 
 
 def test_no_input_at_all_designs_for_stability() -> None:
     model = replace(PENDULUM, E=np.zeros((2, 0)))
-    found = design(model, 1, 3, method="quasi-newton", iterations=5)
+    found = design(model, 1, 3, search="quasi-newton", iterations=5)
     assert found.gains is not None
     assert found.analysis is not None
     assert found.analysis.verdict == "stable"
@@ -324,7 +337,7 @@ def test_delays_that_turn_the_feedback_around_are_undecided() -> None:
 
 def test_bounds_are_kept() -> None:
     bounds = Bounds(K1=[[1.0, 3.0, 2.0]], K2=2.0)
-    found = design(HIRM, 1, 3, bounds=bounds, method="quasi-newton", iterations=10)
+    found = design(HIRM, 1, 3, bounds=bounds, search="quasi-newton", iterations=10)
     gains = assert_proved(found, HIRM)
     assert np.all(np.abs(gains.K1) <= np.array([[1.0, 3.0, 2.0]]))
     assert np.all(np.abs(gains.K2) <= 2.0)
@@ -332,14 +345,14 @@ def test_bounds_are_kept() -> None:
 
 
 def test_bounds_hold_in_convexification() -> None:
-    found = design(HIRM, 1, 3, bounds=Bounds(2.0, 2.0), method="convexify", iterations=5)
+    found = design(HIRM, 1, 3, bounds=Bounds(2.0, 2.0), search="convexify", iterations=5)
     gains = assert_proved(found, HIRM)
     assert max(np.max(np.abs(gains.K1)), np.max(np.abs(gains.K2))) <= 2.0
 
 
 def test_effort_weight_makes_gains_smaller() -> None:
-    plain = design(HIRM, 1, 3, method="quasi-newton", iterations=15)
-    thrifty = design(HIRM, 1, 3, method="quasi-newton", iterations=15, weights=Weighting(effort=0.1))
+    plain = design(HIRM, 1, 3, search="quasi-newton", iterations=15)
+    thrifty = design(HIRM, 1, 3, search="quasi-newton", iterations=15, weights=Weighting(effort=0.1))
     assert np.linalg.norm(assert_proved(thrifty, HIRM).K1) < 0.7 * np.linalg.norm(assert_proved(plain, HIRM).K1)
     assert thrifty.objective > thrifty.eta >= plain.eta
 
@@ -379,7 +392,7 @@ def test_interrupted_design_keeps_its_best_gains() -> None:
         if step.iteration == 4 and step.method == "quasi-newton":
             raise KeyboardInterrupt
 
-    found = design(HIRM, 1, 3, method="quasi-newton", progress=interrupt)
+    found = design(HIRM, 1, 3, search="quasi-newton", progress=interrupt)
     assert_proved(found, HIRM)
     assert tuple(seen) == found.history
     assert found.eta == pytest.approx(min(step.eta for step in seen), rel=1e-4)
