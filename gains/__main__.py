@@ -10,6 +10,7 @@ from rich import box
 from rich.columns import Columns
 from rich.console import Console
 from rich.table import Table as Grid
+from threadpoolctl import threadpool_limits
 
 from gains.command import print_json, run, version
 from gains.frontier import frontier
@@ -72,8 +73,9 @@ for command in (certify, bound, witness, schedule, design, frontier):
 
 
 def main() -> None:
-    """Run the ``gains`` command."""
-    run(cli, "gains")
+    """Run the ``gains`` command; on one thread, as the matrices are small and threads cost more than they bring."""
+    with threadpool_limits(limits=1):
+        run(cli, "gains")
 
 
 # -- for programs

@@ -98,6 +98,11 @@ class Barrier:
         """Number of rows of all S: at a minimum of f the cost is within degree/t of the least."""
         return int(len(self.edges) * self.family.base.shape[2])
 
+    def single(self) -> Barrier:
+        """Return the barrier with one storage for all paths, each mode a transition to itself."""
+        modes = np.unique(self.edges[:, 2])
+        return replace(self, edges=np.column_stack([0 * modes, 0 * modes, modes]), paths=1)
+
     def asking(self, eta2: float | None) -> Barrier:
         """Return the barrier that minimises η² (None), or τ at a given η²."""
         return replace(self, eta2=eta2)

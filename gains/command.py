@@ -21,7 +21,7 @@ import orjson
 
 from gains.table import InputError
 
-__all__ = ["BAD_INPUT", "NEGATIVE", "SUCCESS", "FiniteRange", "print_json", "run", "version"]
+__all__ = ["BAD_INPUT", "NEGATIVE", "SUCCESS", "FiniteRange", "print_json", "require_writable", "run", "version"]
 
 SUCCESS = 0
 NEGATIVE = 1
@@ -47,6 +47,21 @@ def version() -> str:
         return metadata.version("lagproof")
     except metadata.PackageNotFoundError:
         return "unknown (not installed)"
+
+
+def require_writable(path: Path) -> None:
+    """Refuse a file that cannot be written, before it is computed.
+
+    Raises
+    ------
+    InputError
+        When there is no folder for it, or it may not be written.
+    """
+    folder = path.resolve().parent
+    if not folder.is_dir():
+        raise InputError(f"{path}: expected a folder to write to, found none at {folder}")
+    if path.is_dir() or not os.access(path if path.exists() else folder, os.W_OK):
+        raise InputError(f"{path}: expected a file that can be written")
 
 
 def print_json(obj: object) -> None:

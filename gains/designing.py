@@ -49,8 +49,6 @@ def run_design(
     """
     model = load_model(model_name)
     start = None if options["start"] is None else load_gains(options["start"])
-    if not output.resolve().parent.is_dir():
-        raise InputError(f"{output}: expected a folder to write to, found none at {output.resolve().parent}")
     begun = _clock()
     with _Reporter() as reporter:
         try:

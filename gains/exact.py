@@ -22,7 +22,7 @@ from gains.verify_switched import check_switched, least_eta_of
 
 __all__ = ["MAX_ROWS", "ExactAnalysis", "eta", "program_rows", "stability"]
 
-MAX_ROWS = 60_000
+MAX_ROWS = 30_000
 """Rows of a program that are still solved in minutes; beyond it an answer without η is better than none."""
 
 _RELAX = (1e-4, 1e-2)  # relative, of η: how far from an optimum that is not attained a proof is sought

@@ -18,7 +18,7 @@ from rich.table import Table
 
 from gains.command import NEGATIVE, SUCCESS, FiniteRange, print_json
 from gains.model import Gains, Model
-from gains.proving import JSON_OPTION, TRANSITIONS_OPTION
+from gains.proving import JSON_OPTION, PLOT_OPTION, TRANSITIONS_OPTION, writable
 from gains.store import DELAY_LIMIT, load_model
 from gains.table import InputError
 
@@ -53,8 +53,8 @@ class Entry(NamedTuple):
 @TRANSITIONS_OPTION
 @click.option("--delta", type=FiniteRange(min=0.0), default=0.0, help="Bound on the uncertainty; default 0: none.")
 @click.option("--steady-state", type=click.Choice(["exact", "free"]), default="exact", show_default=True)
-@click.option("-o", "--output", type=click.Path(dir_okay=False, path_type=Path), help="Write a CSV file.")
-@click.option("--plot", type=click.Path(dir_okay=False, path_type=Path), help="Write a plot.")
+@click.option("-o", "--output", type=click.Path(path_type=Path), callback=writable, help="Write a CSV file.")
+@PLOT_OPTION
 @JSON_OPTION
 def frontier(
     name: str, d_max: str, d_min: int, output: Path | None, plot: Path | None, as_json: bool, **options: Any
@@ -65,11 +65,6 @@ def frontier(
     """
     model = load_model(name)
     first, last = _range(d_max, d_min)
-    for path in (output, plot):
-        if path is not None and not path.resolve().parent.is_dir():
-            raise InputError(f"{path}: expected a folder to write to, found none at {path.resolve().parent}")
-    if plot is not None and plot.suffix.lower() not in (".png", ".svg", ".pdf"):
-        raise InputError(f"--plot: expected a name ending in .png, .svg or .pdf, found {plot}")
     entries: list[Entry] = []
     for d in range(first, last + 1):
         click.echo(f"gains: designing for delays {d_min} to {d}", err=True)

@@ -3,6 +3,9 @@
 φ_t approaches η²(θ) as t grows. For each t the storages are centred for given gains, which gives the exact gradient and
 Hessian of φ_t; the gains move by a Newton step with a line search, in which the storages are centred anew. Every place
 is strictly feasible, so that the η of every iterate is an upper bound already.
+
+The search begins with one storage for all modes, a small problem that leads most of the way, and goes on from there
+with one for each path.
 """
 
 from __future__ import annotations
@@ -25,7 +28,9 @@ _FINEST = 1e-4  # promised decrease of η² under which the search ends, relativ
 _LOOSE = 4.0  # gap at which a feasible place is first centred
 _CENTRED = 1e-2  # decrement of a centred place
 _ROUNDED = 0.1  # decrement that is taken where rounding allows no less
-_CENTRINGS = 30
+_CENTRINGS = 80
+_INSIDE = 0.3  # gap at which one storage is handed on to all paths
+_STEPS = 60  # most Newton steps in the gains at one gap
 _ATTEMPTS = 12  # trials of the line search over the gains
 _PATIENCE = 3  # steps of little progress before the end
 _BACK = 0.4  # and what it shortens a step by
@@ -62,27 +67,41 @@ def interior_point(
     eta : float or None
         An η that the gains are known to have.
     """
-    family = task.family(K)
     law = task.law
-    barrier = Barrier(family, task.graph.edges, len(task.graph.paths), task.box.reshape(-1), law.K0, law.N)
+    family = task.family(K)
+    whole = Barrier(family, task.graph.edges, len(task.graph.paths), task.box.reshape(-1), law.K0, law.N)
     unit = family.scaling.eta_unit
     known = [] if eta is None else [_ABOVE * (eta / unit) ** 2]
-    at = _first(barrier, family, task.free(K), [*known, *_LIMITS])
-    if at is None:
-        return
-    at = _lowered(barrier, at)
-    yield _reached(task, at, unit, _GAPS[0])
-    for level in _GAPS:
-        t = barrier.degree / (level * at.cost)
-        at = _centred(barrier, at, t) or at
-        for place in _descent(barrier, at, t, max(0.1 * level, _FINEST)):
-            at = place
+    at: Place | None = None
+    before: Barrier | None = None
+    for barrier in (whole.single(), whole) if whole.paths > 1 else (whole,):
+        theta = task.free(K) if at is None else at.theta
+        spread = None if at is None or before is None else _spread(before, at, barrier)
+        start = spread or _first(barrier, family, theta, [*known, *_LIMITS])
+        if start is None:
+            continue
+        at, before = start if spread else _lowered(barrier, start), barrier
+        for level in _GAPS:
+            t = barrier.degree / (level * at.cost)
+            at = _centred(barrier, at, t) or at
             yield _reached(task, at, unit, level)
-            iterations -= 1
-            if iterations <= 0:
-                return
-        if level <= gap:
-            return
+            for place, _ in zip(_descent(barrier, at, t, max(0.1 * level, _FINEST)), range(_STEPS), strict=False):
+                at = place
+                yield _reached(task, at, unit, level)
+                iterations -= 1
+                if iterations <= 0:
+                    return
+            if level <= gap:
+                break
+
+
+def _spread(single: Barrier, at: Place, whole: Barrier) -> Place | None:
+    """Return the place of one storage for all, well inside, as one of the same storage for each path."""
+    at = _centred(single, at, single.degree / (_INSIDE * at.cost)) or at
+    mode = {int(k): e for e, (_, _, k) in enumerate(single.edges)}
+    mu = at.mu[[mode[int(k)] for k in whole.edges[:, 2]]] if len(at.mu) else at.mu
+    place = at._replace(P=np.repeat(at.P, whole.paths, axis=0), mu=mu)
+    return place if whole.holds(place) else None
 
 
 def _reached(task: LiftedTask, at: Place, unit: float, gap: float) -> Reached:

@@ -7,7 +7,6 @@ which the colour-blind can tell apart; what is proved and what is refuted differ
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -23,7 +22,7 @@ from gains.model import Model
 from gains.plotdata import Margins, Response, Window
 from gains.table import InputError
 
-__all__ = ["FORMATS", "margins_figure", "plot_margins", "plot_response", "require_writable", "response_figure"]
+__all__ = ["FORMATS", "margins_figure", "plot_margins", "plot_response", "require_format", "response_figure"]
 
 _SIZE_INCH = (9.0, 7.5)
 _DPI = 150
@@ -46,21 +45,15 @@ _MEANING = {"stable": "proved stable", "unstable": "refuted by a sequence", "und
 _METADATA: dict[str, dict[str, Any]] = {"png": {"Software": None}, "svg": {"Date": None}, "pdf": {"CreationDate": None}}
 
 
-def require_writable(path: Path) -> None:
-    """Refuse a file that a figure cannot be written to, before it is computed.
+def require_format(path: Path) -> None:
+    """Refuse a file whose suffix is none of ``FORMATS``.
 
     Raises
     ------
     InputError
-        When the suffix is none of ``FORMATS``, or the file or its folder cannot be written.
     """
     if path.suffix[1:].lower() not in FORMATS:
         raise InputError(f"{path}: expected a file that ends with {', '.join('.' + each for each in FORMATS)}")
-    folder = path.resolve().parent
-    if not folder.is_dir():
-        raise InputError(f"{path}: expected a folder to write to, found none at {folder}")
-    if path.is_dir() or not os.access(path if path.exists() else folder, os.W_OK):
-        raise InputError(f"{path}: expected a file that can be written")
 
 
 def plot_margins(path: Path, margins: Margins) -> None:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from gains.command import NEGATIVE, SUCCESS, FiniteRange, print_json, version
+from gains.command import NEGATIVE, SUCCESS, FiniteRange, print_json, require_writable, version
 from gains.model import GainLaw, Gains, Schedule
 from gains.store import DELAY_LIMIT, load_gains, load_law, model_path, save_gains
 from gains.table import InputError
@@ -25,7 +25,19 @@ if TYPE_CHECKING:
     from gains.lyapunov import Analysis
     from gains.switched import Transitions
 
-__all__ = ["JSON_OPTION", "bound", "certify", "design", "parse_window", "schedule", "witness", "write_certified"]
+__all__ = [
+    "JSON_OPTION",
+    "PLOT_OPTION",
+    "TRANSITIONS_OPTION",
+    "bound",
+    "certify",
+    "design",
+    "parse_window",
+    "schedule",
+    "witness",
+    "writable",
+    "write_certified",
+]
 
 JSON_OPTION = click.option("--json", "as_json", is_flag=True, help="Print one JSON object on standard output.")
 TRANSITIONS_OPTION = click.option(
@@ -34,19 +46,29 @@ TRANSITIONS_OPTION = click.option(
 _clock = time.perf_counter  # noqa: TID251  # a command says how long it took
 
 
-def _writable(_context: click.Context, _option: click.Parameter, plot: Path | None) -> Path | None:
-    """Refuse a plot that cannot be written before anything is computed."""
+def writable(_context: click.Context, _option: click.Parameter, path: Path | None) -> Path | None:
+    """Refuse a file that cannot be written before anything is computed."""
+    if path is not None:
+        require_writable(path)
+    return path
+
+
+def drawable(context: click.Context, option: click.Parameter, plot: Path | None) -> Path | None:
+    """Refuse a plot that cannot be written, or in an unknown format, before anything is computed."""
     if plot is not None:
-        from gains.plot import require_writable  # with the plotting library: most commands do without
+        from gains.plot import require_format  # with the plotting library: most commands do without
 
-        require_writable(plot)
-    return plot
+        require_format(plot)
+    return writable(context, option, plot)
 
 
+GAIN_FILE_OPTION = click.option(
+    "-o", "--output", type=click.Path(path_type=Path), callback=writable, required=True, help="The gain file."
+)
 PLOT_OPTION = click.option(
     "--plot",
     type=click.Path(path_type=Path),
-    callback=_writable,
+    callback=drawable,
     metavar="FILE",
     help="Draw the answer: a .png, .svg or .pdf file.",
 )
@@ -60,7 +82,9 @@ PLOT_OPTION = click.option(
 @click.option("--delta", type=FiniteRange(min=0.0), default=0.0, help="Bound on the uncertainty; default 0: none.")
 @click.option("--memory", type=click.IntRange(0, 2), default=0, show_default=True, help="Past delays a storage knows.")
 @click.option("--flown/--no-flown", default=True, show_default=True, help="Certify the law as it runs too.")
-@click.option("-o", "--output", type=click.Path(path_type=Path), help="Write the gains with their certificate.")
+@click.option(
+    "-o", "--output", type=click.Path(path_type=Path), callback=writable, help="Write the gains with their certificate."
+)
 @JSON_OPTION
 def certify(
     name: str,
@@ -214,7 +238,7 @@ def _bound_sufficient(gains: Gains, d_min: int, limit: int, method: str, transit
 @click.argument("name", metavar="GAINS")
 @click.option("--delay", required=True, metavar="MIN:MAX", help="Window of delays in samples.")
 @TRANSITIONS_OPTION
-@click.option("-o", "--output", type=click.Path(dir_okay=False, path_type=Path), required=True, help="The CSV file.")
+@click.option("-o", "--output", type=click.Path(path_type=Path), callback=writable, required=True, help="The CSV file.")
 @PLOT_OPTION
 @JSON_OPTION
 def witness(name: str, delay: str, transitions: Transitions, output: Path, plot: Path | None, as_json: bool) -> int:
@@ -231,7 +255,9 @@ def witness(name: str, delay: str, transitions: Transitions, output: Path, plot:
 
 @click.command()
 @click.argument("names", metavar="GAINS...", nargs=-1, required=True)
-@click.option("-o", "--output", type=click.Path(dir_okay=False, path_type=Path), required=True, help="The gain file.")
+@click.option(
+    "-o", "--output", type=click.Path(path_type=Path), callback=writable, required=True, help="The gain file."
+)
 @TRANSITIONS_OPTION
 @click.option("--delta", type=FiniteRange(min=0.0), default=0.0, help="Bound on the uncertainty; default 0: none.")
 @JSON_OPTION
@@ -294,7 +320,9 @@ def schedule(names: tuple[str, ...], output: Path, transitions: Transitions, del
     metavar="K1|K2 NUMBER",
     help="Bound on the size of every entry; may be repeated.",
 )
-@click.option("-o", "--output", type=click.Path(dir_okay=False, path_type=Path), required=True, help="The gain file.")
+@click.option(
+    "-o", "--output", type=click.Path(path_type=Path), callback=writable, required=True, help="The gain file."
+)
 @JSON_OPTION
 def design(model: str, delay: str, output: Path, as_json: bool, transitions: str, **options: Any) -> int:
     """Design gains for MODEL with a small eta for every delay in a window, and prove it.

@@ -25,6 +25,7 @@ from gains.model import GainLaw, Matrix, read_only, sets_of
 __all__ = ["Graph", "Key", "Mode", "Switched", "Transitions", "as_flown", "eq9", "factor", "graph", "state_loop"]
 
 Transitions = Literal["any", "fifo"]
+_ROUNDING = 1e-14  # a coefficient below it is that of rounding
 
 
 class Mode(NamedTuple):
@@ -126,8 +127,9 @@ def factor(K1: Matrix) -> tuple[Matrix, Matrix]:
     K1 : ndarray, shape (rows, nx)
     """
     rows, nx = K1.shape
-    size = np.linalg.norm(K1, axis=1, keepdims=True)
-    unit = K1 / np.where(size > 0.0, size, 1.0)  # a row's rank does not depend on its length
+    column = _powers(np.max(np.abs(K1), axis=0, initial=0.0))
+    row = _powers(np.max(np.abs(K1 / column), axis=1, initial=0.0))
+    unit = K1 / column / row[:, None]  # the rank does not depend on the units of x and u
     rank = int(np.linalg.matrix_rank(unit))
     if rank == rows:
         return np.eye(rows), K1.copy()
@@ -136,9 +138,15 @@ def factor(K1: Matrix) -> tuple[Matrix, Matrix]:
     _, _, order = qr(unit.T, mode="economic", pivoting=True)
     chosen = np.sort(order[:rank])
     L = np.asarray(np.linalg.lstsq(unit[chosen].T, unit.T, rcond=None)[0].T, dtype=np.float64)
-    L = L * size / size[chosen].T if rank else L
+    L[np.abs(L) < _ROUNDING] = 0.0
+    L = L * row[:, None] / row[chosen]
     L[chosen] = np.eye(rank)
     return L, K1[chosen]
+
+
+def _powers(sizes: Matrix) -> Matrix:
+    """Return the nearest powers of two; 1 for zero."""
+    return np.asarray(np.exp2(np.rint(np.log2(np.where(sizes > 0.0, sizes, 1.0)))), dtype=np.float64)
 
 
 def eq9(law: GainLaw, d_min: int, d_max: int, delta_max: float = 0.0) -> Switched:

@@ -33,7 +33,7 @@ def process(*arguments: str) -> subprocess.CompletedProcess[str]:
 def test_list_names_everything_stored() -> None:
     text = invoke("list")
     entries = json.loads(invoke("list", "--json"))["stored"]
-    assert len(entries) == 6
+    assert len(entries) == 10
     for entry in entries:
         assert entry["name"] in text
         assert Path(entry["path"]).is_file()

@@ -16,7 +16,7 @@ from matplotlib.image import imread
 
 from gains.decide import Bound, Decision, bound, decide
 from gains.model import GainLaw, Gains, Matrix, Schedule, augmented, spectral_radius
-from gains.plot import margins_figure, plot_margins, plot_response, require_writable, response_figure
+from gains.plot import margins_figure, plot_margins, plot_response, require_format, response_figure
 from gains.plotdata import Margins, Response, constant_delays, margins, respond, response
 from gains.store import load_gains
 from gains.table import InputError
@@ -226,7 +226,7 @@ def test_the_same_plot_has_the_same_bytes(kind: str, tmp_path: Path, pendulum: R
 
 
 def test_an_upper_case_suffix_is_a_format_too(tmp_path: Path, pendulum: Response):
-    require_writable(tmp_path / "W.PNG")
+    require_format(tmp_path / "W.PNG")
     plot_response(tmp_path / "W.PNG", pendulum)
     assert imread(tmp_path / "W.PNG").shape[1] >= 1000
 

@@ -35,7 +35,19 @@ def _run(*line: str) -> None:
 def test_a_design_is_written_with_a_certificate_that_verifies(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     file = tmp_path / "mine.toml"
     code, said, _ = answer(
-        capsys, "design", "hirm", "--delay", "1:2", "--method", "quasi-newton", "--start", "hirm-paper", "-o", str(file)
+        capsys,
+        "design",
+        "hirm",
+        "--delay",
+        "1:2",
+        "--method",
+        "lyapunov",
+        "--search",
+        "quasi-newton",
+        "--start",
+        "hirm-paper",
+        "-o",
+        str(file),
     )
     gains = load_gains(file)
     assert code == 0
@@ -50,7 +62,19 @@ def test_a_design_is_written_with_a_certificate_that_verifies(tmp_path: Path, ca
 def test_a_designed_gain_file_certifies_at_what_it_says(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     file = tmp_path / "mine.toml"
     _, designed, _ = answer(
-        capsys, "design", "hirm", "--delay", "1:2", "--method", "quasi-newton", "--start", "hirm-paper", "-o", str(file)
+        capsys,
+        "design",
+        "hirm",
+        "--delay",
+        "1:2",
+        "--method",
+        "lyapunov",
+        "--search",
+        "quasi-newton",
+        "--start",
+        "hirm-paper",
+        "-o",
+        str(file),
     )
     code, certified, _ = answer(capsys, "certify", str(file), "--method", "lyapunov")
     assert code == 0
@@ -58,7 +82,18 @@ def test_a_designed_gain_file_certifies_at_what_it_says(tmp_path: Path, capsys: 
 
 
 def test_effort_costs_gain_and_saves_elevator(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    common = ["design", "hirm", "--delay", "1:2", "--method", "quasi-newton", "--start", "hirm-paper"]
+    common = [
+        "design",
+        "hirm",
+        "--delay",
+        "1:2",
+        "--method",
+        "lyapunov",
+        "--search",
+        "quasi-newton",
+        "--start",
+        "hirm-paper",
+    ]
     _, free, _ = answer(capsys, *common, "-o", str(tmp_path / "a.toml"))
     _, held, _ = answer(capsys, *common, "--weight", "effort", "0.01", "-o", str(tmp_path / "b.toml"))
     assert held["eta"] > free["eta"]
@@ -67,7 +102,18 @@ def test_effort_costs_gain_and_saves_elevator(tmp_path: Path, capsys: pytest.Cap
 
 
 def test_limits_bound_every_entry(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    line = ["design", "hirm", "--delay", "1:2", "--method", "quasi-newton", "--start", "hirm-paper"]
+    line = [
+        "design",
+        "hirm",
+        "--delay",
+        "1:2",
+        "--method",
+        "lyapunov",
+        "--search",
+        "quasi-newton",
+        "--start",
+        "hirm-paper",
+    ]
     _, said, _ = answer(capsys, *line, "--limit", "K1", "4", "--limit", "K2", "4", "-o", str(tmp_path / "a.toml"))
     assert said["eta"] is not None
     assert np.abs(said["K1"]).max() <= 4.0
