@@ -8,7 +8,7 @@ from scipy.linalg import solve_discrete_lyapunov
 
 from gains import lmi, sdp
 from gains.lmi import Block, Slack, Weights, Window
-from gains.lyapunov import eta
+from gains.lyapunov import eta, gradient
 from gains.model import Matrix, augmented
 from gains.sdp import Affine, Backend, Program, Status, Variable, solve
 from gains.store import load_gains
@@ -116,6 +116,7 @@ def test_direct_assembly_and_cvxpy_agree(delta: float) -> None:
     gains = load_gains("hirm-paper")
     direct, reference = (eta(gains, 1, 3, delta, backend=backend) for backend in BACKENDS)
     assert direct.eta == pytest.approx(reference.eta, rel=1e-5)
-    assert direct.dual is not None
-    assert reference.dual is not None
-    np.testing.assert_allclose(direct.dual, reference.dual, rtol=0, atol=5e-3 * np.abs(direct.dual).max())
+    for ours, theirs in zip(gradient(gains, direct), gradient(gains, reference), strict=True):
+        assert ours is not None
+        assert theirs is not None  # the duals themselves are not unique to a solver's accuracy, what they say is
+        np.testing.assert_allclose(ours, theirs, rtol=0, atol=1e-4 * np.abs(theirs).max())

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 
 from gains.certificate import claim_hash, gains_hash, model_hash
 from gains.model import Gains, Model, Schedule, sets_of
+from gains.steady import equilibrium
 from gains.store import (
     DELAY_LIMIT,
     load,
@@ -28,6 +29,7 @@ from gains.store import (
     stored,
 )
 from gains.table import InputError, Table
+from gains.verify import verified
 
 MODEL: dict[str, Any] = {
     "name": "m",
@@ -340,7 +342,8 @@ def test_stored_files_load_under_their_own_names() -> None:
     entries = stored()
     assert [(e.name, e.kind) for e in entries] == [
         ("hirm", "model"), ("hirm-printed", "model"), ("pendulum", "model"), ("pendulum-exact", "model"),
-        ("hirm-paper", "gains"), ("pendulum-paper", "gains"),
+        ("hirm-d3", "gains"), ("hirm-d4", "gains"), ("hirm-d6", "gains"), ("hirm-paper", "gains"),
+        ("pendulum-exact-paper", "gains"), ("pendulum-paper", "gains"),
     ]  # fmt: skip
     for entry in entries:
         item = load(entry.name)
@@ -348,6 +351,31 @@ def test_stored_files_load_under_their_own_names() -> None:
         model = item if isinstance(item, Model) else item.model
         assert set(model.sensors) == set(model.states)
         assert model.actuator is not None
+
+
+@pytest.mark.parametrize(
+    ("name", "window", "eta"),
+    [
+        ("hirm-d3", (1, 3), 0.0755),
+        ("hirm-d4", (1, 4), 0.1175),
+        ("hirm-d6", (1, 6), 0.21),
+        ("pendulum-exact-paper", (1, 7), None),
+    ],
+)
+def test_stored_designs_carry_a_certificate_that_verifies(
+    name: str, window: tuple[int, int], eta: float | None
+) -> None:
+    gains = load_gains(name)
+    assert (gains.d_min, gains.d_max) == window
+    assert verified(gains).passed
+    assert gains.certificate is not None
+    assert gains.certificate["method"] == "exact"
+    if eta is not None:
+        assert gains.certificate["eta"] <= eta
+        at = equilibrium(gains.model)
+        assert at is not None
+        assert gains.K2 is not None
+        np.testing.assert_allclose(np.hstack([gains.K1, gains.K2]) @ at.z, at.u, atol=1e-12)
 
 
 def test_stored_gains_carry_the_printed_windows_and_no_certificate() -> None:
