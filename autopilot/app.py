@@ -13,7 +13,7 @@ from typing import Literal
 import numpy as np
 
 from autopilot.clocksync import ClockSync
-from autopilot.control import SetChanges, choose_set, law_of
+from autopilot.control import ChosenSets, SetChanges, choose_set, law_of
 from autopilot.delay import UNKNOWN, DelayEstimate, DelayEstimator
 from autopilot.failsafe import Event, FailsafeState, Limits, Mode, step
 from autopilot.link.clock import NS_PER_MS, NS_PER_S, NS_PER_US, following
@@ -116,6 +116,7 @@ class AutopilotNode:
         self.laws = [law_of(gains) for gains in self.sets]
         self.gain_set = 0
         self.gain_set_changes = SetChanges()
+        self.chosen = ChosenSets(self.windows)
         self.travel = self.laws[0].travel
         self.reference = self._new_reference()
         self.limits = Limits(config.hold_ns)
@@ -242,10 +243,13 @@ class AutopilotNode:
                 self._command(sample, now_ns)
         elif message.name == "DELAY_K":
             self.vehicle.show(message, now_ns)
-            if not self.samples.counts_from(message.time_boot_ms, message.value, self._first_j):
+            j = self.samples.command_of(message.time_boot_ms, message.value)
+            if j is None or self._first_j is None or j < self._first_j:
                 return  # the command of an autopilot before this one, or of another epoch
             if not self.config.gains.d_min <= message.value <= self.config.gains.d_max:
                 self._failsafe_step(Event.OUTSIDE, f"delay {message.value} reported", now_ns)
+            elif not self.chosen.covers(j, message.value):
+                self._failsafe_step(Event.OUTSIDE, f"delay {message.value} reported of another gain set", now_ns)
 
     def _plant_restarted(self) -> bool:
         """Whether the clock has stepped back since the newest sample: with stamps that jumped back, a restart."""
@@ -256,6 +260,7 @@ class AutopilotNode:
         self._steps_seen = self.clock.steps
         self.samples.restart()
         self.reference = self._new_reference()
+        self.chosen = ChosenSets(self.windows)
         self._last = self._fresh_ns = self._first_j = None
         self._u = self.travel.neutral
         self._event("epoch", f"plant restarted, epoch {self.epoch}", now_ns)
@@ -281,6 +286,7 @@ class AutopilotNode:
         reason = "delay unknown" if forecast.d is None else f"delay {forecast.d}"
         self._failsafe_step(Event.GOOD if inside else Event.OUTSIDE, reason, now_ns)
         self.gain_set = choose_set(self.windows, self.gain_set, forecast.d)
+        self.chosen.note(sample.j, self.gain_set)
         ahead = min(forecast.d, MAX_AHEAD) if forecast.d is not None else gains.d_min
         if self.reference is not None:
             self.reference.advance(sample.j)

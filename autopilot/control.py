@@ -9,14 +9,14 @@ floats do that several times faster than arrays, most of all when the processor'
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from operator import mul
 
 from autopilot.link.clock import NS_PER_S
 from autopilot.link.servo import Travel, travel_of
 from gains.model import Gains
 
-__all__ = ["Law", "SetChanges", "Window", "choose_set", "law_of"]
+__all__ = ["ChosenSets", "Law", "SetChanges", "Window", "choose_set", "law_of"]
 
 TELL_NS = NS_PER_S
 """Changes of the set in force are told of at most once in this time."""
@@ -99,6 +99,38 @@ def choose_set(windows: Sequence[Window], present: int, d: int | None) -> int:
         return present
     rooms = [(min(d - low, high - d), low - high, -i) for i, (low, high) in enumerate(windows) if low <= d <= high]
     return -max(rooms)[2] if rooms else present
+
+
+@dataclass(slots=True)
+class ChosenSets:
+    """Which set computed which command of a schedule, to check the forecast that chose it against what came of it.
+
+    The certificate of a schedule admits an estimate that is wrong by one sample. A command that is held while its
+    delay grows keeps its set, so that its first delay alone counts.
+
+    Parameters
+    ----------
+    windows : sequence of Window
+        Of each set; with one there is nothing to check.
+    """
+
+    windows: Sequence[Window]
+    _sets: dict[int, int] = field(default_factory=dict)
+    _applied: int = -1
+
+    def note(self, j: int, gain_set: int) -> None:
+        """Remember the set of the command of sample j, and no more than the delays of the windows can ask for."""
+        if len(self.windows) > 1:
+            self._sets[j] = gain_set
+            self._sets.pop(j - self.windows[-1][1] - 1, None)
+
+    def covers(self, j: int, d: int) -> bool:
+        """Return whether the set of a command fits the first delay reported of it, to within one sample."""
+        if j <= self._applied or j not in self._sets:
+            return True
+        self._applied = j
+        low, high = self.windows[self._sets[j]]
+        return low - 1 <= d <= high + 1
 
 
 @dataclass(slots=True)

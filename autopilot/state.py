@@ -160,13 +160,12 @@ class SampleAssembler:
         waiting, self._waiting = self._waiting, None
         return self._sample(*waiting)
 
-    def counts_from(self, time_boot_ms: int, d: int, first_j: int | None) -> bool:
-        """Whether a delay d reported at a stamp is that of a command not older than the one of sample ``first_j``."""
-        if first_j is None or self._number is None:
-            return False
+    def command_of(self, time_boot_ms: int, d: int) -> int | None:
+        """Return the sample j of the command that a reported delay d speaks of; None before samples are numbered."""
+        if self._number is None:
+            return None
         k, at_ns = self._number
-        reported_k = k + round((self._unwrap_ms(time_boot_ms, None) - at_ns) / self._Ts_ns)
-        return reported_k - d >= first_j
+        return k + round((self._unwrap_ms(time_boot_ms, None) - at_ns) / self._Ts_ns) - d
 
     def _stamp_ns(self, message: Measurement, peer_ns: int | None) -> int:
         if isinstance(message, AoaSsa):

@@ -125,7 +125,8 @@ def banner(gains: GainLaw, proof: Verification) -> list[StatusText]:
     """Return what a ground station must know at start: whether what flies is proved, and the windows of a schedule."""
     what = f"{'schedule' if isinstance(gains, Schedule) else 'gains'} {gains.name}"
     if proof.passed:
-        texts = [StatusText(Severity.INFO, f"certificate verified: {what}")]
+        fifo = gains.certificate is not None and gains.certificate.get("transitions") == "fifo"
+        texts = [StatusText(Severity.INFO, f"certificate verified{' (fifo)' if fifo else ''}: {what}")]
     else:
         texts = [StatusText(Severity.WARNING, f"no verified certificate: {what}")]
     if isinstance(gains, Schedule):

@@ -7,7 +7,7 @@ What remains undecided has both bounds on the joint spectral radius: what a sequ
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -15,17 +15,20 @@ import numpy as np
 
 from gains.definite import Verification
 from gains.exact import stability
-from gains.model import GainLaw, Matrix, Schedule, sets_of
+from gains.lyapunov import constant_radius
+from gains.model import GainLaw, Gains, Matrix, Schedule, sets_of
 from gains.stability import Budget, Stability, steps
 from gains.switched import Graph, Key, Switched, Transitions, eq9, factor, graph
 from gains.switched_certificate import SwitchedCertificate
 from gains.verify_switched import check_switched
 from gains.witness import Effort, Found, confirm, find_witness
 
-__all__ = ["Bound", "Decision", "bound", "decide", "refute"]
+__all__ = ["Bound", "Decision", "bound", "decide", "possible", "refute"]
 
 _QUICK = Effort(beam=0, depth=0, trajectories=0, steps=0, polished=1, rounds=0)
 _ROBUST_MEMORY = 1
+_SHARE = 1.0 - 1e-9  # of the bound on the uncertainty: what is tried stays inside it, rounding included
+_WIDEST = 64  # delays of a window whose structured sequences are tried before anything else
 _EDGE = 1e-9  # a growth within this of 1 in double precision is worth a confirmation
 
 
@@ -55,7 +58,7 @@ class Decision:
     products, solves : int
         Products examined and semidefinite programs solved.
     reason : str
-        Why undecided; empty otherwise.
+        Why undecided, or at which Δ the witness breaks the loop; empty otherwise.
     """
 
     verdict: Literal["stable", "unstable", "undecided"]
@@ -140,7 +143,19 @@ def decide(
 
 
 def refute(law: GainLaw, d_min: int, d_max: int, transitions: Transitions = "any") -> Decision | None:
-    """Return the decision where a structured delay sequence breaks the loop; None where a search would be needed."""
+    """Return the decision where a structured delay sequence breaks the loop; None where a search would be needed.
+
+    Constant delays come first, the smallest before all: their loops are small, whatever the window.
+    """
+    if isinstance(law, Gains):
+        for d in range(d_min, d_max + 1):
+            if constant_radius(law, d) <= 1.0 + _EDGE:
+                continue
+            growth = confirm(law, [d])
+            if growth > 1.0:
+                return Decision("unstable", d_min, d_max, witness=(d,), growth=growth, lower=growth)
+    if d_max - d_min > _WIDEST:
+        return None
     return _Case(law, d_min, d_max, transitions, 0.0, _QUICK, False).search(0)
 
 
@@ -228,12 +243,15 @@ class _Case:
         found = find_witness(self.switched, self.walks, effort, starts=starts, polish=thorough and self.best)
         self.found = found
         self.looked += found.products
-        lower = max(self.known.lower, found.growth)
-        self.known = replace(self.known, lower=lower, products=self.known.products + found.products)
-        if found.growth <= 1.0 - _EDGE:
-            return None
+        self.known = replace(self.known, products=self.known.products + found.products)
         sets = [self.switched.modes[i].gain_set for i in found.modes]
-        growth = confirm(self.law, [Key(d, which) for d, which in zip(found.delays, sets, strict=True)])
+        if not possible(found.delays, sets):
+            return None
+        growth = found.growth
+        if growth > 1.0 - _EDGE:  # near and above 1 double precision does not decide
+            growth = confirm(self.law, [Key(d, which) for d, which in zip(found.delays, sets, strict=True)])
+        lower = max(self.known.lower, growth)
+        self.known = replace(self.known, lower=lower)
         if not growth > 1.0:
             return None
         return replace(
@@ -242,7 +260,6 @@ class _Case:
             witness=found.delays,
             witness_sets=tuple(sets) if len(sets_of(self.law)) > 1 else None,
             growth=growth,
-            lower=max(lower, growth),
         )
 
     def proved(self, found: Stability) -> Decision:
@@ -268,6 +285,13 @@ class _Case:
             refuted = self.search(turn)
             if refuted is not None:
                 return refuted
+        for sign, law in self._perturbed():
+            refuted = refute(law, self.d_min, self.d_max, self.transitions)
+            if refuted is not None:
+                note = f"Delta held at {sign}{self.delta_max:g}"
+                return replace(
+                    self.known, verdict="unstable", witness=refuted.witness, growth=refuted.growth, reason=note
+                )
         for memory in range(_ROBUST_MEMORY + 1):
             analysis = stability(
                 self.law,
@@ -287,9 +311,23 @@ class _Case:
                     verification=analysis.verification,
                     upper=upper,
                 )
+        for nominal in steps(self.switched, self.law, self.transitions):
+            self.known = replace(self.known, upper=min(self.known.upper, nominal.upper))
         return self.undecided(
             f"no storages prove it for ||Delta|| <= {self.delta_max:g}; the bounds are those of Delta = 0"
         )
+
+    def _perturbed(self) -> list[tuple[str, Gains]]:
+        """Return the gains on the models of constant Δ = ±δ I, inside the bound, with the sign; none of a schedule."""
+        law, model = self.law, self.law.model
+        if model.uncertainty is None or not isinstance(law, Gains):
+            return []
+        F, J1, J2 = model.uncertainty.F, model.uncertainty.J1, model.uncertainty.J2
+        corner = _SHARE * self.delta_max * np.eye(F.shape[1], J1.shape[0])
+        return [
+            (sign, replace(law, model=replace(model, A=model.A + F @ held @ J1, B=model.B + F @ held @ J2)))
+            for sign, held in (("+", corner), ("-", -corner))
+        ]
 
     def undecided(self, reason: str) -> Decision:
         """Return what is known."""
@@ -303,6 +341,13 @@ class _Case:
         return replace(
             self.known, verdict="stable", certificate=certificate, verification=verification, unbounded=unbounded
         )
+
+
+def possible(delays: Sequence[int], sets: Sequence[int]) -> bool:
+    """Whether each command of a cycle, which may come back with a larger delay, keeps one gain set throughout."""
+    L = len(delays)
+    used = {((k - d) % L, which) for k, (d, which) in enumerate(zip(delays, sets, strict=True))}
+    return len({j for j, _ in used}) == len(used)
 
 
 def _factors(law: GainLaw) -> tuple[Matrix | None, Matrix | None]:

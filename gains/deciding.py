@@ -16,20 +16,21 @@ from typing import Any, NamedTuple
 import click
 
 from gains.command import NEGATIVE, SUCCESS, print_json
-from gains.decide import Bound, Decision, bound, decide, refute
+from gains.decide import Bound, Decision, bound, decide, possible, refute
 from gains.exact import ExactAnalysis, eta, program_rows
 from gains.lower_gain import worst_gain
 from gains.model import GainLaw, Gains, Schedule
 from gains.plotdata import margins, response
 from gains.proving import write_certified
 from gains.store import load_gains, model_path, resolve
-from gains.switched import Transitions, eq9, graph
+from gains.switched import Switched, Transitions, eq9, graph
 from gains.table import InputError
 from gains.witnessfile import Witness, write_witness
 
 __all__ = ["Question", "run_bound", "run_certify", "run_schedule", "run_witness"]
 
 _FLOWN_ROWS = 6_000  # of the programs of the law as it runs: larger ones take minutes
+_STAYS = (30,)  # samples
 _SHOWN = 12  # delays of a sequence that are printed one by one
 _clock = time.perf_counter  # noqa: TID251  # a command says how long it took
 
@@ -47,6 +48,8 @@ class Question(NamedTuple):
         Bound on ‖Δ‖.
     memory : int
         Past delays that a storage knows.
+    flown : bool
+        Whether the law as it runs is asked, too.
     """
 
     law: GainLaw
@@ -55,6 +58,7 @@ class Question(NamedTuple):
     transitions: Transitions
     delta_max: float
     memory: int
+    flown: bool
 
 
 class Certified(NamedTuple):
@@ -97,12 +101,12 @@ class Certified(NamedTuple):
         return "undecided" if self.decision is None else self.decision.verdict
 
 
-def run_certify(question: Question, name: str, output: Path | None, *, as_json: bool, flown: bool) -> int:
+def run_certify(question: Question, name: str, output: Path | None, *, as_json: bool) -> int:
     """Certify by the exact method, print the answer, write the gains, and return the exit code."""
     start = _clock()
     law = question.law
     click.echo(f"gains: certifying {law.name}, delay {_window(question)}, method exact", err=True)
-    found = _certified(question, flown=flown)
+    found = _certified(question)
     seconds = _clock() - start
     if output is not None and (found.proof is None or not write_certified(output, model_path(name), law, found.proof)):
         click.echo(f"gains: {output} not written: there is no certificate", err=True)
@@ -205,24 +209,29 @@ def run_schedule(names: Sequence[str], output: Path, transitions: Transitions, d
     for before, after in pairwise(sets):
         if not before.d_min < after.d_min <= before.d_max + 1 <= after.d_max:
             windows = ", ".join(f"{own.name} {own.d_min} to {own.d_max}" for own in sets)
-            raise InputError(f"schedule: expected windows that rise without a gap, none in another, found {windows}")
+            hint = "'gains certify NAME --delay MIN:MAX -o FILE' narrows a window"
+            raise InputError(
+                f"schedule: expected windows that rise without a gap, none in another, found {windows}; {hint}"
+            )
     model = sets[0].model
     if delta > 0.0 and model.uncertainty is None:
         raise InputError(f"--delta: expected 0, as model {model.name} has no [uncertainty], found {delta:g}")
     named = tuple(replace(own, name=f"{output.stem}[{i}]", model=model, certificate=None) for i, own in enumerate(sets))
     law = Schedule(output.stem, model, named)
-    question = Question(law, law.d_min, law.d_max, transitions, delta, 0)
-    return run_certify(question, names[0], output, as_json=as_json, flown=True)
+    question = Question(law, law.d_min, law.d_max, transitions, delta, 0, True)
+    return run_certify(question, names[0], output, as_json=as_json)
 
 
-def _certified(question: Question, *, flown: bool) -> Certified:
-    law, d_min, d_max, transitions, delta_max, memory = question
+def _certified(question: Question) -> Certified:
+    law, d_min, d_max, transitions, delta_max, memory, _ = question
     switched = eq9(law, d_min, d_max, delta_max)
     analysis: ExactAnalysis | None = None
     refuted = refute(law, d_min, d_max, transitions)
     if refuted is not None:
         return Certified(None, refuted, None, None, None, None)
     if switched.m:
+        rows = program_rows(law, d_min, d_max, transitions, delta_max, None, memory)
+        click.echo(f"gains: seeking storages for eta: {switched.N} states, a program of {rows} rows", err=True)
         analysis = eta(law, d_min, d_max, transitions=transitions, delta_max=delta_max, memory=memory)
         if analysis.verdict != "stable":
             click.echo(f"gains: no eta: {analysis.reason}; deciding stability alone", err=True)
@@ -231,15 +240,24 @@ def _certified(question: Question, *, flown: bool) -> Certified:
         return Certified(analysis, decision, None, None, None, None)
     click.echo(f"gains: eta {analysis.eta:.6g} verified; seeking delay sequences that reach it", err=True)
     nominal = eq9(law, d_min, d_max)
-    lower, worst = worst_gain(nominal, graph(nominal, law, transitions))
+    walks = graph(nominal, law, transitions)
+    lower, worst = worst_gain(nominal, walks, _slow_cycles(nominal))
     delays = tuple(nominal.modes[i].d for i in worst)
-    unaligned, aligned = _as_flown(question) if flown and law.model.nr else (None, None)
+    unaligned, aligned = _as_flown(question) if question.flown and law.model.nr else (None, None)
+    if not possible(delays, [nominal.modes[i].gain_set for i in worst]):
+        return Certified(analysis, None, None, None, unaligned, aligned)
     return Certified(analysis, None, lower, delays, unaligned, aligned)
+
+
+def _slow_cycles(switched: Switched) -> list[list[int]]:
+    """Return cycles that stay long at the smallest, then at the largest delay: where the search of a gain begins."""
+    low, high = 0, switched.index(max(mode.d for mode in switched.modes))
+    return [[low] * m + list(range(low + 1, high)) + [high] * n for m in _STAYS for n in _STAYS]
 
 
 def _as_flown(question: Question) -> tuple[float | None, float | None]:
     """Return η of the law as it runs, xr not predicted and predicted by any number of samples in the window."""
-    law, d_min, d_max, transitions, delta_max, _ = question
+    law, d_min, d_max, transitions, delta_max, _, _ = question
     found: list[float | None] = []
     for aheads in ((0,), tuple(range(d_min, d_max + 1))):
         if program_rows(law, d_min, d_max, transitions, delta_max, aheads) > _FLOWN_ROWS:
@@ -301,6 +319,7 @@ def _certify_lines(question: Question, found: Certified) -> list[str]:
         assert decision is not None
         if decision.witness is not None:
             grows = f"{_sequence(decision.witness)} grows {decision.growth:.6f} per sample"
+            grows += f", {decision.reason}" if decision.reason else ""
             return [f"{law.name}: unstable for {where}: {grows}"]
         return [f"{law.name}: undecided for {where}: {_undecided(decision)}"]
     lines = [f"{law.name}: stable for {where}, survives {_latency(law, question.d_max)}"]
@@ -312,10 +331,11 @@ def _certify_lines(question: Question, found: Certified) -> list[str]:
             gap = analysis.eta / found.eta_lower - 1.0 if found.eta_lower > 0.0 else float("inf")
             reached = f"{found.eta_lower:.6g} (gap {gap:.1%}): {_sequence(found.worst)}"
             lines.append(f"    a delay sequence reaches                {reached}")
-        if found.unaligned is not None:
-            lines.append(f"  eta as flown, xr not predicted            {found.unaligned:.6g}")
-        if found.aligned is not None:
-            lines.append(f"  eta as flown, xr predicted, r held        {found.aligned:.6g}")
+        if question.law.model.nr and question.flown:
+            lines.append(f"  eta as flown, xr not predicted            {_or_not(found.unaligned)}")
+            lines.append(
+                f"  eta as flown, xr predicted by any of them {_or_not(found.aligned)} (r held, not known ahead)"
+            )
     if proof.verification is not None:
         lines.append(f"  verified: margin {proof.verification.margin:.2g}, rounding {proof.verification.rounding:.2g}")
     return lines
@@ -366,6 +386,10 @@ def _bound_lines(law: GainLaw, d_min: int, limit: int, transitions: Transitions,
         grows = f"grows {found.refuted.growth:.6f} per sample"
         lines.append(f"  {found.refuted.d_max}: refuted: {_sequence(found.refuted.witness)} {grows}")
     return lines
+
+
+def _or_not(value: float | None) -> str:
+    return "not computed: the program is too large" if value is None else f"{value:.6g}"
 
 
 def _window(question: Question) -> str:

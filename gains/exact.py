@@ -22,7 +22,7 @@ from gains.verify_switched import check_switched, least_eta_of
 
 __all__ = ["MAX_ROWS", "ExactAnalysis", "eta", "program_rows", "stability"]
 
-MAX_ROWS = 30_000
+MAX_ROWS = 12_000
 """Rows of a program that are still solved in minutes; beyond it an answer without η is better than none."""
 
 _RELAX = (1e-4, 1e-2)  # relative, of η: how far from an optimum that is not attained a proof is sought
@@ -131,9 +131,10 @@ def program_rows(
     transitions: Transitions = "any",
     delta_max: float = 0.0,
     aheads: Sequence[int] | None = None,
+    memory: int = 0,
 ) -> int:
-    """Return the rows of the program of :func:`eta` without memory: what its cost grows with."""
-    question = _ask(law, d_min, d_max, transitions, delta_max, 0, aheads)
+    """Return the rows of the program of :func:`eta`: what its cost grows with."""
+    question = _ask(law, d_min, d_max, transitions, delta_max, memory, aheads)
     return _rows(question.switched, question.graph)
 
 

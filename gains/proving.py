@@ -115,8 +115,8 @@ def certify(
     if method == "exact":
         from gains.deciding import Question, run_certify  # with the solver: listing and showing do without
 
-        question = Question(law, d_min, d_max, transitions, delta, memory)
-        return run_certify(question, name, output, as_json=as_json, flown=flown)
+        question = Question(law, d_min, d_max, transitions, delta, memory, flown)
+        return run_certify(question, name, output, as_json=as_json)
     gains = load_gains(name)
     if d_max < 1:
         raise InputError("--delay: expected a window up to at least 1 sample, found 0:0")

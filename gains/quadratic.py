@@ -65,8 +65,10 @@ def lyapunov_quadratic(F: Matrix) -> Quadratic | None:
         P = P + power.T @ P @ power
         power = power @ power
     try:
-        S = np.linalg.cholesky(P).T / units[None, :]
+        S = np.linalg.cholesky(P).T / units[None, :] if np.isfinite(P).all() else None
     except np.linalg.LinAlgError:
+        S = None
+    if S is None:
         return None
     return Quadratic(_form(S)[None], float(_rates(F[None], S)[0]), 0)
 
@@ -185,7 +187,13 @@ def _in_form(F: Matrix, S: Matrix) -> Matrix:
 
 
 def _rates(F: Matrix, S: Matrix) -> Matrix:
-    return np.asarray(np.linalg.norm(_in_form(F, S), 2, axis=(1, 2)), dtype=np.float64)
+    """Return ‖S F_i S⁻¹‖; infinite where numbers are too far apart to tell."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        turned = _in_form(F, S)
+    finite = np.isfinite(turned).all(axis=(1, 2))
+    rates = np.full(len(F), np.inf)
+    rates[finite] = np.linalg.norm(turned[finite], 2, axis=(1, 2))
+    return rates
 
 
 def _form(S: Matrix) -> Matrix:

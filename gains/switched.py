@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from fractions import Fraction
 from itertools import product
 from typing import Literal, NamedTuple
 
@@ -25,7 +26,8 @@ from gains.model import GainLaw, Matrix, read_only, sets_of
 __all__ = ["Graph", "Key", "Mode", "Switched", "Transitions", "as_flown", "eq9", "factor", "graph", "state_loop"]
 
 Transitions = Literal["any", "fifo"]
-_ROUNDING = 1e-14  # a coefficient below it is that of rounding
+_GRID = 2.0**24  # coefficients of a factorisation are sought on this grid first
+_ULPS = Fraction(8, 2**52)  # relative, of every entry: what evaluating the law rounds away as well
 
 
 class Mode(NamedTuple):
@@ -117,10 +119,10 @@ class Graph:
 
 
 def factor(K1: Matrix) -> tuple[Matrix, Matrix]:
-    """Return L, R with K1 = L R and as many rows in R as the rank of K1; both exact where K1 has full row rank.
+    """Return L, R with K1 = L R and as few rows in R as its rank asks for: rows of K1, or the identity.
 
-    R holds rows of K1 (of full row rank: all of them), or, where there are more independent rows than columns,
-    the identity. Else the product equals K1 to within the rounding of the law itself.
+    Every entry of the product equals that of K1 to within the rounding of the law itself; where no fewer rows do that,
+    all are kept.
 
     Parameters
     ----------
@@ -131,17 +133,27 @@ def factor(K1: Matrix) -> tuple[Matrix, Matrix]:
     row = _powers(np.max(np.abs(K1 / column), axis=1, initial=0.0))
     unit = K1 / column / row[:, None]  # the rank does not depend on the units of x and u
     rank = int(np.linalg.matrix_rank(unit))
-    if rank == rows:
-        return np.eye(rows), K1.copy()
-    if rank == nx:
-        return K1.copy(), np.eye(nx)
-    _, _, order = qr(unit.T, mode="economic", pivoting=True)
-    chosen = np.sort(order[:rank])
-    L = np.asarray(np.linalg.lstsq(unit[chosen].T, unit.T, rcond=None)[0].T, dtype=np.float64)
-    L[np.abs(L) < _ROUNDING] = 0.0
-    L = L * row[:, None] / row[chosen]
-    L[chosen] = np.eye(rank)
-    return L, K1[chosen]
+    if rank < min(rows, nx):
+        _, _, order = qr(unit.T, mode="economic", pivoting=True)
+        chosen = np.sort(order[:rank])
+        raw = np.linalg.lstsq(unit[chosen].T, unit.T, rcond=None)[0].T
+        for L in (np.rint(raw * _GRID) / _GRID, raw):  # a coefficient with few digits is exact
+            L = L * row[:, None] / row[chosen]
+            L[chosen] = np.eye(rank)
+            if _is_product(L, K1[chosen], K1):
+                return L, K1[chosen]
+    return (np.eye(rows), K1.copy()) if rows <= nx else (K1.copy(), np.eye(nx))
+
+
+def _is_product(L: Matrix, R: Matrix, K1: Matrix) -> bool:
+    """Whether every entry of L R, computed without rounding, is that of K1 to within a few units in its last place."""
+    left, right = ([[Fraction(x) for x in line] for line in matrix.tolist()] for matrix in (L, R.T))
+    return all(
+        abs(sum((a * b for a, b in zip(row, column, strict=True)), Fraction(0)) - Fraction(K1[i, j]))
+        <= _ULPS * abs(Fraction(K1[i, j]))
+        for i, row in enumerate(left)
+        for j, column in enumerate(right)
+    )
 
 
 def _powers(sizes: Matrix) -> Matrix:

@@ -166,6 +166,8 @@ def _aheads(table: Table) -> tuple[int, ...] | None:
         return None
     if not len(values) or not all(value == int(value) and 0 <= value <= MAX_DELAY for value in values):
         raise table.error("aheads", "whole numbers of samples", f"{values.tolist()}")
+    if len(set(values.tolist())) != len(values):
+        raise table.error("aheads", "each value once", f"{values.tolist()}")
     return tuple(int(value) for value in values)
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from fractions import Fraction
 from typing import NamedTuple
 
 import numpy as np
@@ -25,8 +26,9 @@ __all__ = ["check_switched", "least_eta_of"]
 
 _ENTRIES = 1 << 24  # of all modes' maps together: what is larger is not a certificate but a load
 _AHEAD = 10_000  # samples: beyond it a prediction is none
-_PRODUCT = 16  # a rank factorisation may differ from K1 by this many roundings
-_CANCELLED = 1e3  # its terms may be that much larger than K1
+_OPERATIONS = 1 << 31  # of the eigenvalues of all transitions: some ten seconds
+_ULPS = Fraction(8, 2**52)  # relative, of every entry of K1
+_SPARE = 16  # operations beyond those that are counted
 
 
 class _Key(NamedTuple):
@@ -64,9 +66,13 @@ def _checked(law: GainLaw, certificate: SwitchedCertificate) -> Verification:
     loop = _Loop(law, certificate)
     if loop.storages > MAX_STORAGES:
         return failed("there are more storages than a certificate may hold")
+    if len(loop.edges) * (loop.size + loop.m + loop.p) ** 3 > _OPERATIONS:
+        return failed("there is more to check than a certificate may ask for")
     if loop.beyond():
         return failed("a number is too small or too large to be computed with")
     if certificate.blocks:
+        if any(block.kind == "paths" and block.memory != certificate.memory for block in certificate.blocks):
+            return failed("a block has another memory than the certificate")
         return _worst([_schur(law), _blocks(loop, certificate)])
     shape = (loop.storages, loop.size, loop.size)
     if certificate.P.shape != shape:
@@ -143,10 +149,10 @@ def _entries(law: GainLaw, certificate: SwitchedCertificate) -> int:
 
 
 def _factors(law: GainLaw, certificate: SwitchedCertificate) -> bool:
-    """Whether K1 is the product of the factors, to within the rounding of the law itself; true where there are none.
+    """Whether every entry of the factors' product is that of K1 to within the law's own rounding; true without factors.
 
-    Rounding is reckoned by the scales of the rows and columns of K1, so that units do not matter; factors that are
-    far larger than their product cancel, and are none.
+    The product is computed without rounding, and an entry that is zero must be zero: what is proved is the law that
+    flies, to within a few units in the last place of each gain.
     """
     left, right = certificate.left, certificate.right
     if left is None and right is None:
@@ -154,13 +160,15 @@ def _factors(law: GainLaw, certificate: SwitchedCertificate) -> bool:
     wanted = np.vstack([gains.K1 for gains in sets_of(law)])
     if left is None or right is None or (len(left), right.shape[1]) != wanted.shape or left.shape[1] != len(right):
         return False
-    if not (np.abs(left).max(initial=0.0) < MOST and np.abs(right).max(initial=0.0) < MOST):
+    if not (np.isfinite(left).all() and np.isfinite(right).all()):
         return False
-    columns = np.abs(wanted).max(axis=0)
-    rows = np.max(np.abs(wanted) / np.where(columns > 0.0, columns, 1.0), axis=1)
-    scale, size = rows[:, None] * columns, np.abs(left) @ np.abs(right)
-    close = np.abs(left @ right - wanted) <= _PRODUCT * EPS * (scale + size)
-    return bool(np.all(close & (size <= _CANCELLED * scale)))
+    rows, columns = ([[Fraction(x) for x in line] for line in X.tolist()] for X in (left, right.T))
+    return all(
+        abs(sum((a * b for a, b in zip(row, column, strict=True)), Fraction(0)) - Fraction(wanted[i, j]))
+        <= _ULPS * abs(Fraction(wanted[i, j]))
+        for i, row in enumerate(rows)
+        for j, column in enumerate(columns)
+    )
 
 
 class _Loop:
@@ -242,6 +250,11 @@ class _Loop:
         largest = max(np.abs(part).max(initial=0.0) for part in (c.P, *(b.P for b in c.blocks)))
         if sizes.min() < LEAST or max(sizes.max(), largest) > MOST:
             return True
+        model, sets = self.model, self.sets
+        given = [model.A, model.B, model.C, model.D, model.E, self.left, self.right, *(own.K1 for own in sets)]
+        given += [_K2(own) for own in sets]
+        if any(np.any((np.abs(part) < LEAST) & (part != 0.0)) for part in given):
+            return True  # a product that underflows would look like no connection
         maps = (self.mode(key, ahead) for key in self.keys for ahead in self.aheads)
         parts = (part for one in maps for part in (one.step_, one.output_, one.right_))
         return any(np.abs(part).max(initial=0.0) > MOST for part in parts)
@@ -337,7 +350,7 @@ class _Loop:
     def operations(self) -> int:
         """Roundings behind an entry at most, with room to spare."""
         inner = self.size + self.model.ny + self.q + self.model.nu + self.width
-        return 4 * inner + 8 * (self.nr + 1) * (max(self.aheads) + 2) + _PRODUCT
+        return 4 * inner + 8 * (self.nr + 1) * (max(self.aheads) + 2) + _SPARE
 
 
 def _K2(gains: Gains) -> Matrix:

@@ -30,6 +30,9 @@ Cycles = NDArray[np.intp]
 _EDGE = 1e-9  # a growth within this of 1 is neither above nor below
 _BETTER = 1e-12  # relative: less is the rounding of the same product, repeated or rotated
 _AT_ONCE = 1 << 21  # numbers in one batch of products
+_MOST_SQUARINGS = 90
+_SETTLED = 1e-17  # change of log ρ(M) under which a squaring ends
+_UNRELIABLE = 1e-3  # rounding of a power, relative, beyond which its trace says nothing
 _COARSE = (1, 2, 3, 4, 6, 8, 11, 15, 20, 27)
 
 
@@ -137,9 +140,9 @@ def confirm(law: GainLaw, sequence: Sequence[int | Key], digits: int = 50) -> fl
     """Return the growth per sample of a periodic sequence, from A, B and K1 as they stand, in multiple precision.
 
     A period takes h = (x(k); K1 x(k−1); …; K1 x(k−d)), d the largest delay of the sequence, to M h: M comes from
-    running Eq. (4) under Eq. (9), and ρ(M) from ‖M^k‖^(1/k), k = 1, 2, 4, …, which falls to it and is about twice as
-    near each time; the rest is less than 10^(−digits/2). A result above 1 proves that the loop diverges: the nearest
-    double to the growth is above 1 only where the growth is so by more than 1e-16.
+    running Eq. (4) under Eq. (9). ρ(M) lies below ‖M^k‖^(1/k), which falls to it, and above (|tr M^k|/N)^(1/k); every
+    squaring carries a bound on its rounding. A result above 1 proves that the loop diverges; where the digits do not
+    suffice more are carried, and where those do not either the result is at most 1.
 
     Parameters
     ----------
@@ -147,28 +150,52 @@ def confirm(law: GainLaw, sequence: Sequence[int | Key], digits: int = 50) -> fl
     sequence : sequence of int or Key
         One period: d(0), …, d(L−1); of a schedule, with the gain set of each command.
     digits : int
-        Decimal digits carried.
+        Decimal digits carried at first.
     """
     keys = [key if isinstance(key, Key) else Key(key) for key in sequence]
+    growth = 1.0
+    for carried in (digits, 4 * digits, 20 * digits):
+        growth, certain = _growth(law, keys, carried)
+        if certain:
+            return growth
+    return min(growth, 1.0)
+
+
+def _growth(law: GainLaw, keys: Sequence[Key], digits: int) -> tuple[float, bool]:
+    """Return the growth per sample, and whether the digits suffice for it: only then is more than 1 a proof."""
     with mpmath.workdps(digits):
-        period = _period(law, keys)
-        N = period.rows
-        log_norm, last, k = mpmath.mpf(0), mpmath.inf, 1  # period = M^k / e^(k log_norm)
-        while True:
-            size = mpmath.mnorm(period, "f")
+        unit = mpmath.mpf(10) ** (2 - digits)
+        power = _period(law, keys)
+        N = power.rows
+        error = unit * N * len(keys) * mpmath.mnorm(_period(law, keys, modulus=True), "f")
+        log_norm, last, proved = mpmath.mpf(0), mpmath.inf, False
+        for squarings in range(_MOST_SQUARINGS):
+            k = 2**squarings  # power = M^k / e^(k log_norm), to within the error
+            size = mpmath.mnorm(power, "f")
             if not size:
-                return 0.0
-            period /= size
+                return 0.0, True  # never a witness
+            power, error = power / size, error / size + N * unit
             log_norm += mpmath.log(size) / k
-            if last - log_norm <= mpmath.mpf(10) ** (-digits // 2) and k > N:
-                return float(mpmath.exp(log_norm / len(keys)))
-            last, period, k = log_norm, period * period, 2 * k
+            if error > _UNRELIABLE:
+                break
+            trace = abs(sum(power[i, i] for i in range(N))) - N * error
+            proved = proved or (trace > 0 and log_norm + mpmath.log(trace / N) / k > 0)
+            settled = last - log_norm <= _SETTLED and k > N
+            if settled and (proved or log_norm + mpmath.log1p(error) / k <= 0):
+                return float(mpmath.exp(log_norm / len(keys))), True
+            last = log_norm
+            power, error = power * power, 2 * error + error**2 + N * unit
+        return float(mpmath.exp(log_norm / len(keys))), False
 
 
-def _period(law: GainLaw, keys: Sequence[Key]) -> Any:
-    """Return M with h(L) = M h(0) as an mpmath matrix, shape (N, N); see :func:`confirm`."""
-    A, B = (_rows(matrix) for matrix in (law.model.A, law.model.B))
-    K1 = {key.gain_set: _rows(sets_of(law)[key.gain_set].K1) for key in keys}
+def _period(law: GainLaw, keys: Sequence[Key], *, modulus: bool = False) -> Any:
+    """Return M with h(L) = M h(0) as an mpmath matrix, shape (N, N), or a majorant of it; see :func:`confirm`."""
+
+    def of(matrix: Matrix) -> Matrix:
+        return np.abs(matrix) if modulus else matrix
+
+    A, B = (_rows(of(matrix)) for matrix in (law.model.A, law.model.B))
+    K1 = {key.gain_set: _rows(of(sets_of(law)[key.gain_set].K1)) for key in keys}
     nx, nu, depth = law.model.nx, law.model.nu, max(key.d for key in keys)
     N = nx + nu * len(K1) * depth
     unit = iter(mpmath.eye(N).tolist())

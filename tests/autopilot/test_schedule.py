@@ -77,12 +77,18 @@ def test_no_fresh_state_leaves_tracking_after_the_largest_d_max_whatever_set_is_
     assert b.mode == "HOLD"
 
 
-def test_a_reported_delay_in_another_sets_window_is_inside():
+@pytest.mark.parametrize(("d", "mode"), [(3, "TRACKING"), (4, "HOLD")])
+def test_a_forecast_may_be_wrong_by_one_sample_and_no_more(d: int, mode: str):
+    b = flown(*[1] * 10)  # set 0, window 1..2
+    b.give(NamedValueInt(b.now_ns // MS, "DELAY_K", d))
+    assert b.mode == mode
+
+
+def test_a_command_that_is_held_while_its_delay_grows_keeps_its_set():
     b = flown(*[1] * 10)
-    b.give(NamedValueInt(b.now_ns // MS, "DELAY_K", 4))
-    assert b.mode == "TRACKING"
-    b.give(NamedValueInt(b.now_ns // MS, "DELAY_K", 5))
-    assert b.mode == "HOLD"
+    for d in (2, 3, 4):  # of one command: its stamp moves on with its delay
+        b.give(NamedValueInt(b.now_ns // MS + (d - 4) * TS // MS, "DELAY_K", d))
+        assert b.mode == "TRACKING"
 
 
 @pytest.mark.parametrize("failsafe", ["on", "monitor"])

@@ -137,9 +137,6 @@ def test_gains_whose_rank_is_lost_in_rounding_are_decided() -> None:
     BK[:3, :3], BK[3] = HIRM.model.B @ HIRM.K1, [3.0, 3.0, 3.0, -0.45]  # of rank two but for rounding
     found = decided(of(A, BK))
     assert_proved(of(A, BK), found, "any", flights=100)
-    assert found.certificate is not None
-    assert found.certificate.right is not None
-    assert len(found.certificate.right) == 2
 
 
 # -- windows
@@ -183,8 +180,8 @@ def test_an_uncertain_pole_is_proved_exactly_as_far_as_it_stays_inside() -> None
     assert inside.certificate is not None
     assert inside.certificate.delta_max == 0.499
     outside = decide(uncertain(0.5), 1, 2, delta_max=0.501)
-    assert (outside.verdict, outside.certificate) == ("undecided", None)
-    assert "0.501" in outside.reason
+    assert (outside.verdict, outside.certificate, outside.reason) == ("unstable", None, "Delta held at +0.501")
+    assert outside.growth == pytest.approx(1.001, rel=1e-6)
 
 
 @pytest.mark.parametrize(("d_max", "verdict"), [(2, "stable"), (5, "unstable")])

@@ -9,7 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gains.model import Gains, Matrix, Schedule, spectral_radius
+from gains.decide import decide
+from gains.model import Gains, Matrix, Model, Schedule, Trim, spectral_radius
 from gains.store import load_gains
 from gains.switched import Graph, Key, Mode, Switched, Transitions, as_flown, eq9, graph, state_loop
 from gains.witness import Effort, Found, confirm, find_witness, primitive, successors
@@ -207,3 +208,28 @@ def test_confirmed_growth_tells_the_least_growth_from_none(pole: float, expected
     A = np.array([[pole, 1.0], [0.0, pole]])  # one eigenvector: the norm of its powers tends slowly
     still = replace(FEASIBLE, model=replace(FEASIBLE.model, A=A), K1=np.zeros((1, 2)))
     assert confirm(still, (1, 3, 2)) == expected
+
+
+def test_cancellation_beyond_the_digits_refutes_no_stable_loop() -> None:
+    a = np.array([2.0**200, -(2.0**200) + 2.0**150, -(2.0**150) + 2.0**100, -(2.0**100) + 2.0**50, -(2.0**50) + 1.0])
+    A, B, E, C, D = 0.5 * np.outer(np.ones(5), a), np.zeros((5, 1)), np.zeros((5, 0)), np.eye(1, 5), np.zeros((1, 1))
+    model = Model("cancelling", 0.1, A, B, E, C, D, tuple("abcde"), Trim(np.zeros(5), np.zeros(1)))
+    assert confirm(Gains("cancelling", model, 1, 1, np.zeros((1, 5))), [1]) <= 1.0  # the spectral radius is 0.5
+
+
+def test_an_entry_that_is_small_beside_its_row_and_column_is_not_lost() -> None:
+    A = np.array([[0.5, 0, 0], [1e15, 0.5, 0], [0, 0, 0.5]])
+    B = np.array([[0.0, 1, 0], [0, 0, 0], [0, 0, 0]])
+    K1 = np.array([[0.1, 0, 0.1], [0.1, 2e-15, 0.1], [0, 1, 0]])
+    model = Model(
+        "steep",
+        0.1,
+        A,
+        B,
+        np.zeros((3, 0)),
+        np.eye(1, 3),
+        np.zeros((1, 3)),
+        ("a", "b", "c"),
+        Trim(np.zeros(3), np.zeros(3)),
+    )
+    assert decide(Gains("steep", model, 1, 2, K1), 1, 2).verdict == "unstable"
