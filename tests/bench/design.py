@@ -1,8 +1,8 @@
 """A design for delays 1 to 6 against the same evaluations of η and its gradient written plainly in cvxpy.
 
 The plain way takes minutes, so it is counted: the seconds of one plain evaluation, measured in this run (full-size
-storages, one ``cvxpy.Problem`` for each, Clarabel), times the evaluations that a descent would need: one for each
-accepted step of our search, the least that any descent needs from the same start.
+storages, one ``cvxpy.Problem`` for each, Clarabel), times the accepted steps of our search. A quasi-Newton descent
+takes another number of evaluations, more than its accepted steps: the count stands in for it.
 """
 
 from __future__ import annotations
