@@ -51,7 +51,9 @@ def test_lifting_over_the_gains_has_the_spectrum_and_the_gain_of_lifting_over_th
     gains = loop(rng)
     switched, full = eq9(gains, *window), full_state(gains, *window)
     assert keys_of(switched) == keys_of(full)
-    assert (gains.model.nx - np.linalg.matrix_rank(gains.K1)) * window[1] == full.N - switched.N
+    saved = full.N - switched.N  # a rank that is lost to within rounding only may not be made use of
+    assert (gains.model.nx - min(gains.K1.shape)) * window[1] <= saved
+    assert saved <= (gains.model.nx - np.linalg.matrix_rank(gains.K1)) * window[1]
     cycle = rng.integers(len(switched.modes), size=int(rng.integers(1, 6))).tolist()
     radius, expected = (spectral_radius(product_of(form.F, cycle)) for form in (switched, full))
     assert radius == pytest.approx(expected, rel=1e-6, abs=1e-6)
