@@ -18,9 +18,9 @@ from gains.model import Matrix
 from gains.quasinewton import Iterate
 from gains.task import Gain, Task
 
-__all__ = ["convexification"]
+__all__ = ["convexification", "roots"]
 
-_FLOOR = 1e-10  # smallest eigenvalue of P0 and R0 taken, relative to the largest
+_FLOOR = 1e-10  # smallest eigenvalue of a storage taken, relative to the largest
 
 
 def convexification(task: Task, K: Matrix, iterations: int, tolerance: float = 1e-4) -> Iterator[Iterate]:
@@ -52,8 +52,8 @@ def convexification(task: Task, K: Matrix, iterations: int, tolerance: float = 1
 def _step(task: Task, at: Gain) -> Matrix:
     """Return the gains that minimise η over the inner approximation at P0, R0; NaN where the solver fails."""
     n, eye = task.n, np.eye(task.n)
-    P_root, P_inverse = _roots(at.weights.P)
-    R_root, R_inverse = _roots(at.weights.R)
+    P_root, P_inverse = roots(at.weights.P)
+    R_root, R_inverse = roots(at.weights.R)
     left = [P_inverse, P_inverse, np.eye(task.m), R_root, P_root, np.eye(task.C0.shape[0])]
     left += [np.eye(task.J0.shape[0])] if task.robust else []
 
@@ -81,7 +81,7 @@ def _step(task: Task, at: Gain) -> Matrix:
     return np.asarray(task.gains(solution.values["theta"]), dtype=np.float64)
 
 
-def _roots(X: Matrix) -> tuple[Matrix, Matrix]:
+def roots(X: Matrix) -> tuple[Matrix, Matrix]:
     """Return X^½ and X^−½."""
     values, vectors = np.linalg.eigh((X + X.T) / 2)
     values = np.sqrt(np.maximum(values, _FLOOR * values[-1]))

@@ -15,14 +15,13 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 
 from gains import sdp
+from gains.convexify import roots
 from gains.lifted_task import Family, LiftedGain, LiftedTask
 from gains.lmi import Block, Blocks
 from gains.model import Matrix
 from gains.quasinewton import Iterate
 
 __all__ = ["lifted_convexification"]
-
-_FLOOR = 1e-10  # smallest eigenvalue of P0 taken, relative to the largest
 
 
 def lifted_convexification(task: LiftedTask, K: Matrix, iterations: int, tolerance: float = 1e-4) -> Iterator[Iterate]:
@@ -56,7 +55,7 @@ def _step(task: LiftedTask, K: Matrix, at: LiftedGain) -> Matrix:
     family, paths = task.family(K), len(task.graph.paths)
     t = np.diag(family.scaling.T)
     P0 = at.answer.P * t * t[:, None] / family.scaling.e_unit**2
-    roots = [_roots(P) for P in P0]
+    factors = [roots(P) for P in P0]
     variables = {f"P{i}": sdp.Variable(family.N, family.N, symmetric=True) for i in range(paths)}
     variables |= {"eta2": sdp.Variable(), "theta": sdp.Variable(task.law.N.shape[1], 1)}
     if family.p:
@@ -65,7 +64,8 @@ def _step(task: LiftedTask, K: Matrix, at: LiftedGain) -> Matrix:
     def statement(v: Mapping[str, Block]) -> sdp.Program:
         stacks = [_stack(family, v["theta"], mode) for mode in range(len(family.base))]
         blocks = [
-            _transition(family, stacks[k], v, (i, j, e), roots) for e, (i, j, k) in enumerate(task.graph.edges.tolist())
+            _transition(family, stacks[k], v, (i, j, e), factors)
+            for e, (i, j, k) in enumerate(task.graph.edges.tolist())
         ]
         positive = [v[name] for name in variables if name.startswith(("P", "lam"))]
         return sdp.Program(v["eta2"], blocks, [*positive, *task.units.room(task.units.gains(v["theta"]))])
@@ -88,15 +88,15 @@ def _transition(
     stack: Block,
     v: Mapping[str, Block],
     edge: tuple[int, int, int],
-    roots: list[tuple[Matrix, Matrix]],
+    factors: list[tuple[Matrix, Matrix]],
 ) -> Blocks:
     """Return the convex inequality of one transition, in coordinates where both storages are I at the start."""
     i, j, e = edge
     N, ny, m = family.N, family.ny, family.m
     rows = np.eye(N + ny + family.q)
     into = np.zeros((N + m, N + m))
-    into[:N, :N], into[N:, N:] = roots[i][1], np.eye(m)
-    step = roots[j][0] @ rows[:N] @ stack @ into
+    into[:N, :N], into[N:, N:] = factors[i][1], np.eye(m)
+    step = factors[j][0] @ rows[:N] @ stack @ into
     output, right = rows[N : N + ny] @ stack @ into, rows[N + ny :] @ stack @ into
     above, below = np.eye(N, N + m), np.eye(m, N + m, N)
     own = above.T @ v[f"P{i}"] @ above + v["eta2"] * (below.T @ below)
@@ -104,17 +104,10 @@ def _transition(
     if not family.p:
         zero = np.zeros((N, ny))
         return [[-own, step.T, output.T], [step, -next_, zero], [output, zero.T, -np.eye(ny)]]
-    lam, pushed = v[f"lam{e}"], roots[j][0] @ family.base[0][:N, N + m :]
+    lam, pushed = v[f"lam{e}"], factors[j][0] @ family.base[0][:N, N + m :]
     return [
         [-own, step.T, output.T, right.T],
         [step, lam * (pushed @ pushed.T) - next_, np.zeros((N, ny)), np.zeros((N, family.q))],
         [output, np.zeros((ny, N)), -np.eye(ny), np.zeros((ny, family.q))],
         [right, np.zeros((family.q, N)), np.zeros((family.q, ny)), -lam * np.eye(family.q)],
     ]
-
-
-def _roots(X: Matrix) -> tuple[Matrix, Matrix]:
-    """Return X^½ and X^−½."""
-    values, vectors = np.linalg.eigh((X + X.T) / 2)
-    values = np.sqrt(np.maximum(values, _FLOOR * values[-1]))
-    return (vectors * values) @ vectors.T, (vectors / values) @ vectors.T

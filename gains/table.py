@@ -20,7 +20,7 @@ from typing import Any, Final, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["MAX_FILE_BYTES", "InputError", "Table", "describe"]
+__all__ = ["MAX_FILE_BYTES", "InputError", "Table", "describe", "read_content"]
 
 MAX_FILE_BYTES = 64 * 2**20  # a certificate of some hundred modes stays far below
 
@@ -42,6 +42,34 @@ class _Absent(Enum):
 
 
 REQUIRED: Final = _Absent.REQUIRED
+
+
+def read_content(path: str | Path, what: str) -> bytes:
+    """Return the content of a file of at most ``MAX_FILE_BYTES``.
+
+    Parameters
+    ----------
+    path : str or Path
+    what : str
+        What is expected there, for the complaint about nothing.
+
+    Raises
+    ------
+    InputError
+        When the file is missing, unreadable or too large.
+    """
+    try:
+        with open(path, "rb") as file:
+            content = file.read(MAX_FILE_BYTES + 1)
+    except FileNotFoundError:
+        raise InputError(f"{path}: expected {what}, found nothing of that name") from None
+    except OSError as error:
+        raise InputError(f"{path}: expected a readable file, found: {error.strerror}") from None
+    except ValueError as error:  # a NUL in the name
+        raise InputError(f"{path}: expected a file name, found: {error}") from None
+    if len(content) > MAX_FILE_BYTES:
+        raise InputError(f"{path}: expected at most {MAX_FILE_BYTES} bytes, found more")
+    return content
 
 
 class Table:
@@ -78,19 +106,7 @@ class Table:
         InputError
             When the file is missing, unreadable, too large, not UTF-8 or not TOML.
         """
-        source = str(path)
-        try:
-            with open(path, "rb") as file:
-                content = file.read(MAX_FILE_BYTES + 1)
-        except FileNotFoundError:
-            raise InputError(f"{source}: expected a file, found nothing of that name") from None
-        except OSError as error:
-            raise InputError(f"{source}: expected a readable file, found: {error.strerror}") from None
-        except ValueError as error:  # a NUL in the name
-            raise InputError(f"{source}: expected a file name, found: {error}") from None
-        if len(content) > MAX_FILE_BYTES:
-            raise InputError(f"{source}: expected at most {MAX_FILE_BYTES} bytes, found more")
-        return cls.parse(content, source)
+        return cls.parse(read_content(path, "a file"), str(path))
 
     @classmethod
     def parse(cls, content: bytes, source: str) -> Table:

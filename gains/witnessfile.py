@@ -29,7 +29,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import NoReturn
 
-from gains.table import MAX_FILE_BYTES, InputError
+from gains.table import InputError, read_content
 
 __all__ = ["MAX_PERIOD", "TRANSITIONS", "Witness", "read_witness", "write_witness"]
 
@@ -148,18 +148,7 @@ def write_witness(path: str | Path, witness: Witness) -> None:
 def _lines(path: str | Path, source: str) -> Iterable[str]:
     """Return the lines of a text file, without the space around them."""
     try:
-        with open(path, "rb") as file:
-            content = file.read(MAX_FILE_BYTES + 1)
-    except FileNotFoundError:
-        raise InputError(f"{source}: expected a witness file, found nothing of that name") from None
-    except OSError as error:
-        raise InputError(f"{source}: expected a readable file, found: {error.strerror}") from None
-    except ValueError as error:  # a NUL in the name
-        raise InputError(f"{source}: expected a file name, found: {error}") from None
-    if len(content) > MAX_FILE_BYTES:
-        raise InputError(f"{source}: expected at most {MAX_FILE_BYTES} bytes, found more")
-    try:
-        text = content.decode("utf-8-sig")
+        text = read_content(path, "a witness file").decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise InputError(f"{source}: expected UTF-8 text, found byte {error.start} that is not") from None
     return (line.strip() for line in text.split("\n"))

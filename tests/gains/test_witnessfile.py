@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gains import witnessfile
+from gains import table
 from gains.table import InputError
 from gains.witnessfile import MAX_PERIOD, Witness, read_witness, write_witness
 
@@ -147,7 +147,7 @@ def test_what_cannot_be_read_is_refused(tmp_path: Path, monkeypatch: pytest.Monk
     (tmp_path / "w.csv").write_bytes(GOOD.encode("utf-16"))
     with pytest.raises(InputError, match="expected UTF-8 text"):
         read_witness(tmp_path / "w.csv")
-    monkeypatch.setattr(witnessfile, "MAX_FILE_BYTES", 20)
+    monkeypatch.setattr(table, "MAX_FILE_BYTES", 20)
     with pytest.raises(InputError, match="expected at most 20 bytes"):
         read(tmp_path, GOOD)
 
