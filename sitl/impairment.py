@@ -21,10 +21,12 @@ One packet meets, in this order:
 
 Randomness: every feature draws from a stream of its own (loss, duplication; reordering and jitter of the
 first copy; the same of the second), one value per packet whatever became of the packets before and
-whatever becomes of this one. The n-th packet's jitter is therefore the same with loss and without,
-at 1 % and at 10 %: flights under different links compare packet by packet.
+whatever becomes of this one (two for loss in bursts: the move of its state and the loss). The n-th
+packet's jitter is therefore the same with loss and without, at 1 % and at 10 %: flights under different
+links compare packet by packet.
 
-To add a jitter model, write a class and register it with ``@_jitter``.
+To add a model, write a class and register it: a jitter with ``@_named(_JITTERS, ...)``, a loss with
+``@_named(_LOSSES, ...)``.
 
 References
 ----------
@@ -34,12 +36,13 @@ Linux ``net/sched/sch_netem.c``.
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 from types import MappingProxyType
-from typing import NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -47,15 +50,31 @@ from autopilot.link.clock import NS_PER_S
 
 __all__ = [
     "JITTERS",
+    "LOSSES",
     "Copy",
     "Fate",
     "GammaJitter",
+    "GilbertElliott",
     "Impairment",
     "Jitter",
     "LinkSpec",
+    "Loss",
     "NormalJitter",
     "UniformJitter",
 ]
+
+_Model = TypeVar("_Model", bound=type)
+
+
+def _named(models: dict[str, type[Any]], name: str) -> Callable[[_Model], _Model]:
+    """Register a model under its name in a SPEC."""
+
+    def register(model: _Model) -> _Model:
+        assert name not in models
+        models[name] = model
+        return model
+
+    return register
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,26 +94,13 @@ class Jitter(ABC):
         """Return a source of jitter in ns. It owns ``rng``; a correlated model keeps its state in it."""
 
 
-_MODELS: dict[str, type[Jitter]] = {}
+_JITTERS: dict[str, type[Jitter]] = {}
 
-JITTERS: Mapping[str, type[Jitter]] = MappingProxyType(_MODELS)
+JITTERS: Mapping[str, type[Jitter]] = MappingProxyType(_JITTERS)
 """Jitter models by their name in a SPEC."""
 
-_J = TypeVar("_J", bound=Jitter)
 
-
-def _jitter(name: str) -> Callable[[type[_J]], type[_J]]:
-    """Register a model under its name in a SPEC."""
-
-    def register(model: type[_J]) -> type[_J]:
-        assert name not in _MODELS
-        _MODELS[name] = model
-        return model
-
-    return register
-
-
-@_jitter("uniform")
+@_named(_JITTERS, "uniform")
 @dataclass(frozen=True, slots=True)
 class UniformJitter(Jitter):
     """Jitter U[0, W]; the scale is the width W."""
@@ -105,7 +111,7 @@ class UniformJitter(Jitter):
         return lambda: width_ns * random()
 
 
-@_jitter("normal")
+@_named(_JITTERS, "normal")
 @dataclass(frozen=True, slots=True)
 class NormalJitter(Jitter):
     """Jitter N(0, S²); the scale is S. A sum of delay and jitter below 0 becomes 0 and raises the mean."""
@@ -116,7 +122,7 @@ class NormalJitter(Jitter):
         return lambda: sigma_ns * normal()
 
 
-@_jitter("gamma")
+@_named(_JITTERS, "gamma")
 @dataclass(frozen=True, slots=True)
 class GammaJitter(Jitter):
     """Jitter Gamma(2, M / 2): two exponential waits in a row; the scale is the mean M."""
@@ -125,6 +131,100 @@ class GammaJitter(Jitter):
         """Return a source of Gamma(2, M / 2)."""
         gamma, half_ns = rng.standard_gamma, self.scale_ns / 2.0
         return lambda: half_ns * gamma(2.0)
+
+
+@dataclass(frozen=True, slots=True)
+class Loss(ABC):
+    """A loss with memory. Its fields are probabilities, in the order of the SPEC; those with a default may stay out."""
+
+    @abstractmethod
+    def sampler(self, rng: np.random.Generator) -> Callable[[], bool]:
+        """Return a source that says of each packet in turn whether it is lost. It owns ``rng`` and keeps the state."""
+
+
+_LOSSES: dict[str, type[Loss]] = {}
+
+LOSSES: Mapping[str, type[Loss]] = MappingProxyType(_LOSSES)
+"""Loss models by their name in a SPEC; the loss without memory is a plain probability."""
+
+
+@_named(_LOSSES, "ge")
+@dataclass(frozen=True, slots=True)
+class GilbertElliott(Loss):
+    """Loss in bursts: two states, each with its loss probability; netem's ``loss gemodel p r 1-h 1-k``.
+
+    As in netem, the first packet finds the good state, and each packet is lost with the probability of the
+    state that it finds. The state moves once per packet, also for packets that meet a blackout, and never
+    with time. (netem draws the move first and the loss second, but takes the loss probability of the state
+    before the move.)
+
+    Attributes
+    ----------
+    p, r : float
+        Probabilities per packet of the moves from good to bad and from bad to good.
+    bad, good : float
+        Loss probabilities in the two states, 1 - h and 1 - k. Gilbert's model has good = 0, and the
+        simple one bad = 1 too.
+
+    References
+    ----------
+    E. N. Gilbert, "Capacity of a burst-noise channel", Bell Syst. Tech. J. 39(5), 1960; E. O. Elliott,
+    "Estimates of error rates for codes on burst-noise channels", Bell Syst. Tech. J. 42(5), 1963;
+    tc-netem(8); ``loss_gilb_ell`` in Linux ``net/sched/sch_netem.c``.
+    """
+
+    p: float
+    r: float
+    bad: float = 1.0
+    good: float = 0.0
+
+    def __post_init__(self) -> None:
+        assert all(0.0 <= probability <= 1.0 for probability in (self.p, self.r, self.bad, self.good))
+
+    @property
+    def bad_share(self) -> float:
+        """Share of packets that find the bad state in the long run, p / (p + r); 0 for p = 0, which stays in good."""
+        return self.p / (self.p + self.r) if self.p > 0.0 else 0.0
+
+    @property
+    def loss_rate(self) -> float:
+        """Share of packets lost in the long run: the states' loss probabilities, weighted by their shares."""
+        return self.bad_share * self.bad + (1.0 - self.bad_share) * self.good
+
+    @property
+    def mean_burst(self) -> float:
+        """Mean number of packets lost in a row, in the long run; 1 / r for bad = 1, good = 0.
+
+        Bursts end as often as they begin, so it is P(lost) / P(lost, and the next one not). NaN when nothing
+        is lost, infinity when a burst never ends.
+        """
+        if self.loss_rate == 0.0:
+            return math.nan
+        pass_after_bad = self.r * (1.0 - self.good) + (1.0 - self.r) * (1.0 - self.bad)
+        pass_after_good = self.p * (1.0 - self.bad) + (1.0 - self.p) * (1.0 - self.good)
+        ends = self.bad_share * self.bad * pass_after_bad + (1.0 - self.bad_share) * self.good * pass_after_good
+        return self.loss_rate / ends if ends > 0.0 else math.inf
+
+    def sampler(self, rng: np.random.Generator) -> Callable[[], bool]:
+        """Return a source of losses. Each packet takes two values: the state's move, then the loss."""
+        random, stay = rng.random, 1.0 - self.r
+        is_bad = False
+
+        def is_lost() -> bool:
+            nonlocal is_bad
+            probability = self.bad if is_bad else self.good
+            # low values lead to bad from either state, so that (for p + r <= 1) a larger p or a smaller r,
+            # like a larger loss probability, loses the same packets and more
+            is_bad = random() < (stay if is_bad else self.p)
+            return random() < probability
+
+        return is_lost
+
+
+def _memoryless(probability: float, rng: np.random.Generator) -> Callable[[], bool]:
+    """Return a source of independent losses. It owns ``rng``."""
+    random = rng.random
+    return lambda: random() < probability
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,7 +237,9 @@ class LinkSpec:
         Constant delay.
     jitter : Jitter or None
         Distribution of the time added to the delay.
-    loss, dup, reorder : float
+    loss : float or Loss
+        Probability that a packet is lost, from 0 to 1, or a model with memory.
+    dup, reorder : float
         Probabilities per packet (reorder: per copy), from 0 to 1.
     keep_order : bool
         Whether packets leave in the order in which they entered.
@@ -149,7 +251,7 @@ class LinkSpec:
 
     delay_ns: int = 0
     jitter: Jitter | None = None
-    loss: float = 0.0
+    loss: float | Loss = 0.0
     dup: float = 0.0
     reorder: float = 0.0
     keep_order: bool = False
@@ -158,7 +260,8 @@ class LinkSpec:
 
     def __post_init__(self) -> None:
         assert self.delay_ns >= 0
-        assert all(0.0 <= probability <= 1.0 for probability in (self.loss, self.dup, self.reorder))
+        assert isinstance(self.loss, Loss) or 0.0 <= self.loss <= 1.0
+        assert all(0.0 <= probability <= 1.0 for probability in (self.dup, self.reorder))
         assert self.rate_bps is None or self.rate_bps > 0
         assert all(start_ns >= 0 and duration_ns >= 0 for start_ns, duration_ns in self.blackouts)
 
@@ -199,7 +302,8 @@ class Impairment:
     def __init__(self, spec: LinkSpec, rng: np.random.Generator) -> None:
         self.spec = spec
         loss, dup, *rest = rng.spawn(6)
-        self._loss, self._dup = loss.random, dup.random
+        self._lost = spec.loss.sampler(loss) if isinstance(spec.loss, Loss) else _memoryless(spec.loss, loss)
+        self._dup = dup.random
         self._reorder = (rest[0].random, rest[1].random)
         jitter = spec.jitter
         self._jitter = None if jitter is None else (jitter.sampler(rest[2]), jitter.sampler(rest[3]))
@@ -231,7 +335,7 @@ class Impairment:
             which it would have left: until then it is in the queue.
         """
         spec = self.spec
-        lost = spec.loss > 0.0 and self._loss() < spec.loss
+        lost = self._lost()
         copies = 1 + (spec.dup > 0.0 and self._dup() < spec.dup)
         flights = [self._draw(which) for which in ((0, 1) if spec.dup > 0.0 else (0,))]
         if lost:

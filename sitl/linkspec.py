@@ -8,14 +8,14 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import MISSING, dataclass, fields
 from decimal import Decimal
 from types import MappingProxyType
 from typing import Any
 
 from autopilot.link.clock import NS_PER_MS, NS_PER_S, NS_PER_US
 from gains.table import InputError
-from sitl.impairment import JITTERS, Jitter, LinkSpec, UniformJitter
+from sitl.impairment import JITTERS, LOSSES, Jitter, LinkSpec, Loss, UniformJitter
 
 __all__ = ["MAX_RATE_BPS", "MAX_TIME_NS", "PRESETS", "format_spec", "parse_link", "parse_spec"]
 
@@ -60,7 +60,7 @@ def _format_time(time_ns: int) -> str:
     return _format_quantity(time_ns, _TIME_UNITS)
 
 
-def _parse_probability(text: str) -> float:
+def _parse_probability(text: str, expected: str = "a probability from 0 to 1") -> float:
     try:
         value = float(text)
     except ValueError:
@@ -68,7 +68,7 @@ def _parse_probability(text: str) -> float:
     if not text.isascii() or "_" in text:  # which float takes
         value = -1.0
     if not 0.0 <= value <= 1.0:
-        raise _Expected("a probability from 0 to 1")
+        raise _Expected(expected)
     return value
 
 
@@ -105,6 +105,35 @@ def _format_jitter(jitter: Jitter) -> str:
     return f"{name}:{_format_time(jitter.scale_ns)}"
 
 
+def _loss_grammar(name: str) -> str:
+    """Return how a loss model is written, as in ``ge:P:R[:BAD[:GOOD]]``."""
+    needed = [parameter.name.upper() for parameter in fields(LOSSES[name]) if parameter.default is MISSING]
+    others = [parameter.name.upper() for parameter in fields(LOSSES[name]) if parameter.default is not MISSING]
+    return ":".join([name, *needed]) + "".join(f"[:{other}" for other in others) + "]" * len(others)
+
+
+def _parse_loss(text: str) -> float | Loss:
+    name, *values = text.split(":")
+    if name not in LOSSES:
+        return _parse_probability(text, f"a probability from 0 to 1 or {', '.join(map(_loss_grammar, LOSSES))}")
+    expected = f"{_loss_grammar(name)}, each a probability from 0 to 1"
+    parameters = fields(LOSSES[name])
+    least = sum(parameter.default is MISSING for parameter in parameters)
+    if not least <= len(values) <= len(parameters):
+        raise _Expected(expected)
+    return LOSSES[name](*(_parse_probability(value, expected) for value in values))
+
+
+def _format_loss(loss: float | Loss) -> str:
+    if not isinstance(loss, Loss):
+        return repr(loss)
+    name = next(name for name, model in LOSSES.items() if type(loss) is model)
+    parameters = list(fields(loss))
+    while parameters and getattr(loss, parameters[-1].name) == parameters[-1].default:
+        parameters.pop()
+    return ":".join([name, *(repr(getattr(loss, parameter.name)) for parameter in parameters)])
+
+
 @dataclass(frozen=True, slots=True)
 class _Keyword:
     """A keyword of the SPEC grammar: the field it sets, and its value from and to text."""
@@ -118,7 +147,7 @@ class _Keyword:
 _KEYWORDS: Mapping[str, _Keyword] = {
     "delay": _Keyword("delay_ns", _parse_time_ns, _format_time),
     "jitter": _Keyword("jitter", _parse_jitter, _format_jitter),
-    "loss": _Keyword("loss", _parse_probability, repr),
+    "loss": _Keyword("loss", _parse_loss, _format_loss),
     "dup": _Keyword("dup", _parse_probability, repr),
     "reorder": _Keyword("reorder", _parse_probability, repr),
     "order": _Keyword("keep_order", _parse_order, lambda _: "keep"),

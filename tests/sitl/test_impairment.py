@@ -1,4 +1,4 @@
-"""Impairment against scipy's distributions and exact schedules."""
+"""Impairment against scipy's distributions, the algebra of Markov chains, and exact schedules."""
 
 from __future__ import annotations
 
@@ -11,7 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from sitl.impairment import JITTERS, Copy, Fate, Impairment, LinkSpec
+from sitl.impairment import JITTERS, LOSSES, Copy, Fate, GilbertElliott, Impairment, LinkSpec
+from sitl.linkspec import parse_spec
+from sitl.relay import RelayNode
 from tests.sitl.links import MS, SAMPLES, S, flights_ns, impairment
 
 
@@ -102,6 +104,171 @@ def test_reordered_packets_skip_the_delay_and_the_rest_keep_it():
     assert accepts(flights.count(0), SAMPLES, 0.05)
 
 
+def test_plain_loss_compares_one_value_a_packet_of_the_first_stream_with_its_probability():
+    link = impairment("loss=0.1,dup=0.1,jitter=normal:1ms", seed=3)
+    values = np.random.default_rng(3).spawn(6)[0].random(1000)
+    assert [link.step(100, n)[0].fate is Fate.LOST for n in range(1000)] == (values < 0.1).tolist()
+
+
+# ------------------------------------------------------------------------------------------- bursty loss
+
+
+def losses(text: str, packets: int = SAMPLES, seed: int = 1) -> np.ndarray:
+    """Which packets are lost."""
+    link = impairment(text, seed)
+    return np.array([not link.schedule(100, n) for n in range(packets)])
+
+
+def runs(flags: np.ndarray) -> np.ndarray:
+    """Lengths of the runs of true, without one that the record may have cut at its end."""
+    edges = np.diff(np.concatenate(([0], flags.astype(int), [0])))
+    lengths = np.flatnonzero(edges == -1) - np.flatnonzero(edges == 1)
+    return lengths[:-1] if len(lengths) and flags[-1] else lengths
+
+
+def chain(model: GilbertElliott) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Transition matrix, loss probabilities and stationary distribution of (good, bad), the last by least squares."""
+    moves = np.array([[1 - model.p, model.p], [model.r, 1 - model.r]])
+    system = np.vstack([moves.T - np.eye(2), np.ones(2)])
+    stationary = np.linalg.lstsq(system, np.array([0.0, 0.0, 1.0]), rcond=None)[0]
+    return moves, np.array([model.good, model.bad]), stationary
+
+
+def correlation(model: GilbertElliott, lag: int) -> float:
+    """Autocorrelation of the loss indicator, by the power of the transition matrix."""
+    moves, loss, stationary = chain(model)
+    rate = stationary @ loss
+    both = (stationary * loss) @ np.linalg.matrix_power(moves, lag) @ loss
+    return float((both - rate**2) / (rate - rate**2))
+
+
+BURSTY = [
+    "ge:0.02:0.18",
+    "ge:0.3:0.1",
+    "ge:0.05:0.1:0.8:0.02",
+    "ge:0.9:0.8",
+    "ge:0.1:0.3:0.2:0.9",
+]
+inner = st.floats(0.01, 0.99)
+
+
+def loss_model(text: str) -> GilbertElliott:
+    model = parse_spec(f"loss={text}").loss
+    assert isinstance(model, GilbertElliott)
+    return model
+
+
+def test_every_loss_model_is_tested_against_its_chain():
+    assert {text.partition(":")[0] for text in BURSTY} == set(LOSSES)
+
+
+@given(p=inner, r=inner, bad=inner, good=inner)
+def test_loss_rate_mean_burst_and_autocorrelation_are_those_of_the_chain(p, r, bad, good):
+    model = GilbertElliott(p, r, bad, good)
+    moves, loss, stationary = chain(model)
+    assert model.loss_rate == pytest.approx(stationary @ loss)
+    # expected length of a run of losses: it begins in the state of a lost packet after one that was not
+    first = (stationary * (1 - loss)) @ moves * loss
+    lasts = np.linalg.solve(np.eye(2) - moves * loss, np.ones(2))
+    assert model.mean_burst == pytest.approx(first / first.sum() @ lasts, rel=1e-6)
+    scale = (bad - good) ** 2 * model.bad_share * (1 - model.bad_share)
+    variance = model.loss_rate * (1 - model.loss_rate)
+    for lag in (1, 2, 7):
+        assert correlation(model, lag) * variance == pytest.approx(scale * (1 - p - r) ** lag, abs=1e-12)
+
+
+def test_loss_rate_and_mean_burst_at_the_edges():
+    assert GilbertElliott(0.02, 0.18).loss_rate == pytest.approx(0.1)
+    assert GilbertElliott(0.02, 0.18).mean_burst == pytest.approx(1 / 0.18)
+    assert GilbertElliott(0.3, 0.7).mean_burst == pytest.approx(1 / 0.7)
+    assert GilbertElliott(0.2, 0.4, 0.5, 0.5).mean_burst == pytest.approx(2.0)  # no memory left
+    stays_good = GilbertElliott(0.0, 0.0)
+    assert stays_good.loss_rate == 0.0
+    assert math.isnan(stays_good.mean_burst)
+    assert GilbertElliott(0.0, 0.5, good=0.25).mean_burst == pytest.approx(4 / 3)
+    stays_bad = GilbertElliott(0.1, 0.0)
+    assert stays_bad.loss_rate == 1.0
+    assert stays_bad.mean_burst == math.inf
+
+
+@pytest.mark.parametrize("text", BURSTY)
+def test_bursty_loss_rate_is_that_of_the_chain(text):
+    model, packets = loss_model(text), 5 * SAMPLES
+    rate = model.loss_rate
+    memory = 1 + 2 * sum(correlation(model, lag) for lag in range(1, 200))
+    sigma = math.sqrt(rate * (1 - rate) * memory / packets)
+    assert abs(losses(f"loss={text}", packets).mean() - rate) < 3.3 * sigma
+
+
+@pytest.mark.parametrize("text", BURSTY)
+def test_bursty_losses_correlate_as_the_chain(text):
+    model, packets = loss_model(text), 5 * SAMPLES
+    lost = losses(f"loss={text}", packets).astype(float)
+    tolerance = 4 * math.sqrt((1 + 2 * sum(correlation(model, lag) ** 2 for lag in range(1, 200))) / packets)
+    for lag in (1, 2, 3, 5, 10, 20):
+        assert np.corrcoef(lost[:-lag], lost[lag:])[0, 1] == pytest.approx(correlation(model, lag), abs=tolerance)
+
+
+@pytest.mark.parametrize("text", BURSTY)
+def test_packets_lost_in_a_row_have_the_mean_burst(text):
+    lengths = runs(losses(f"loss={text}", 5 * SAMPLES))
+    error = lengths.std() / math.sqrt(len(lengths))
+    assert lengths.mean() == pytest.approx(loss_model(text).mean_burst, abs=3.3 * error)
+
+
+@pytest.mark.parametrize("text", ["ge:0.02:0.18", "ge:0.3:0.1", "ge:0.9:0.8"])
+def test_bursts_and_the_gaps_between_them_are_geometric(text):
+    model, lost = loss_model(text), losses(f"loss={text}", 5 * SAMPLES)
+    for flags, end in ((lost, model.r), (~lost, model.p)):
+        lengths = runs(flags)
+        longest = 1  # what is as long goes into one bin, so that no bin expects fewer than 10
+        while len(lengths) * stats.geom.sf(longest, end) > 10:
+            longest += 1
+        found = np.bincount(np.minimum(lengths, longest), minlength=longest + 1)[1:]
+        expected = stats.geom.pmf(np.arange(1, longest + 1), end)
+        expected[-1] = stats.geom.sf(longest - 1, end)
+        assert stats.chisquare(found, len(lengths) * expected).pvalue > 1e-3
+
+
+def test_the_first_packet_finds_the_good_state():
+    assert not any(losses("loss=ge:1:0", 1, seed)[0] for seed in range(100))
+    assert losses("loss=ge:1:0", 100).tolist() == [False] + [True] * 99
+
+
+def test_certain_moves_alternate_between_the_states():
+    assert losses("loss=ge:1:1", 100).tolist() == [False, True] * 50
+    assert losses("loss=ge:1:1:0:1", 100).tolist() == [True, False] * 50
+
+
+def test_a_chain_that_cannot_reach_the_bad_state_loses_only_in_the_good_one():
+    assert not losses("loss=ge:0:0").any()
+    assert not losses("loss=ge:0:0.5").any()
+    assert losses("loss=ge:0:0:0:1").all()
+    assert accepts(int(losses("loss=ge:0:0.5:1:0.1").sum()), SAMPLES, 0.1)
+
+
+@pytest.mark.parametrize("text", ["ge:0.3:0.7", "ge:0.02:0.18:0.3:0.3"])
+def test_a_chain_without_memory_loses_as_plain_loss(text):
+    lost = losses(f"loss={text}")[1:]
+    assert accepts(int(lost.sum()), len(lost), 0.3)
+    assert abs(np.corrcoef(lost[:-1], lost[1:])[0, 1]) < 4 / math.sqrt(SAMPLES)
+
+
+def test_bursts_of_the_two_directions_are_independent():
+    model, packets = loss_model("ge:0.02:0.18"), 5000
+    relay = RelayNode(LinkSpec(loss=model), LinkSpec(loss=model), seed=1)
+    for n in range(packets):
+        relay.receive("plant", b"up", n * MS)
+        relay.receive("autopilot", b"down", n * MS)
+    records = relay.records()
+    lost = [
+        [record.body["fate"] == "lost" for record in records if record.topic == f"link/{way}"] for way in ("up", "down")
+    ]
+    memory = 1 + 2 * sum(correlation(model, lag) ** 2 for lag in range(1, 200))
+    assert all(sum(way) > 300 for way in lost)
+    assert abs(np.corrcoef(lost)[0, 1]) < 4 * math.sqrt(memory / packets)
+
+
 # ------------------------------------------------------------------------------------------------- rate
 
 
@@ -177,8 +344,9 @@ def test_no_packet_leaves_before_it_enters(seed, text, entries):
 # ---------------------------------------------------------------------------------------------- streams
 
 
-def test_same_seed_gives_the_same_schedule_and_another_seed_another():
-    text = "delay=5ms,jitter=gamma:28ms,loss=0.1,dup=0.1,reorder=0.1"
+@pytest.mark.parametrize("loss", ["0.1", "ge:0.02:0.18:0.9:0.01"])
+def test_same_seed_gives_the_same_schedule_and_another_seed_another(loss):
+    text = f"delay=5ms,jitter=gamma:28ms,loss={loss},dup=0.1,reorder=0.1"
     one, same, other = (
         [link.schedule(60, n * MS) for n in range(500)]
         for link in (impairment(text, 7), impairment(text, 7), impairment(text, 8))
@@ -188,7 +356,7 @@ def test_same_seed_gives_the_same_schedule_and_another_seed_another():
 
 
 @pytest.mark.parametrize("jitter", ["uniform:28ms", "normal:4ms", "gamma:20ms"])
-@pytest.mark.parametrize("added", ["loss=0.2", "dup=0.5", "reorder=0.1", "blackout=2s:3s"])
+@pytest.mark.parametrize("added", ["loss=0.2", "loss=ge:0.05:0.2", "dup=0.5", "reorder=0.1", "blackout=2s:3s"])
 def test_adding_a_feature_leaves_the_jitter_of_each_packet_as_it_was(jitter, added):
     base = f"delay=40ms,jitter={jitter}"
     plain, impaired = impairment(base), impairment(f"{base},{added}")
@@ -200,14 +368,39 @@ def test_adding_a_feature_leaves_the_jitter_of_each_packet_as_it_was(jitter, add
     assert 500 < kept < 1000 or (added.startswith("dup") and kept == 1000)
 
 
-def test_packets_lost_at_a_low_rate_are_lost_at_a_high_rate():
-    low, high = impairment("loss=0.1"), impairment("loss=0.3")
-    lost = [(not low.schedule(60, n), not high.schedule(60, n)) for n in range(2000)]
-    assert all(at_high for at_low, at_high in lost if at_low)
+@pytest.mark.parametrize(
+    ("low", "high"),
+    [
+        ("0.1", "0.3"),
+        ("ge:0.02:0.2", "ge:0.05:0.2"),  # more bursts
+        ("ge:0.02:0.2", "ge:0.02:0.1"),  # longer ones
+        ("ge:0.02:0.2:0.5", "ge:0.02:0.2:0.7:0.1"),  # the same, with more loss
+    ],
+)
+def test_packets_lost_at_a_low_rate_are_lost_at_a_high_rate(low, high):
+    at_low, at_high = losses(f"loss={low}", 5000), losses(f"loss={high}", 5000)
+    assert (at_high >= at_low).all()
+    assert at_high.sum() > at_low.sum() > 100
 
 
-def test_entry_times_and_sizes_do_not_change_the_draws():
-    text = "delay=5ms,jitter=uniform:28ms,loss=0.2,dup=0.2"
+@pytest.mark.parametrize(
+    "added", ["delay=5ms", "dup=0.3", "reorder=0.1", "jitter=gamma:1ms", "rate=9600bps,order=keep"]
+)
+def test_adding_a_feature_leaves_the_bursts_as_they_were(added):
+    bursty = "loss=ge:0.02:0.18:0.9:0.01"
+    assert (losses(bursty, 5000) == losses(f"{bursty},{added}", 5000)).all()
+
+
+def test_a_blackout_leaves_the_bursts_after_it_as_they_were():
+    plain, out = impairment("loss=ge:0.05:0.2"), impairment("loss=ge:0.05:0.2,blackout=1s:1s")
+    fates = [(plain.step(60, n * MS)[0].fate, out.step(60, n * MS)[0].fate) for n in range(3000)]
+    assert fates[:1000] + fates[2000:] == [(a, a) for a, _ in fates[:1000] + fates[2000:]]
+    assert {fate for _, fate in fates[1000:2000]} == {Fate.LOST, Fate.BLACKOUT}
+
+
+@pytest.mark.parametrize("loss", ["0.2", "ge:0.05:0.2"])
+def test_entry_times_and_sizes_do_not_change_the_draws(loss):
+    text = f"delay=5ms,jitter=uniform:28ms,loss={loss},dup=0.2"
     dense, sparse = impairment(text), impairment(text)
     for n in range(500):
         at_ns = n * S

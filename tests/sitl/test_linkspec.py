@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gains.table import InputError
-from sitl.impairment import JITTERS, GammaJitter, LinkSpec, NormalJitter, UniformJitter
+from sitl.impairment import JITTERS, GammaJitter, GilbertElliott, LinkSpec, NormalJitter, UniformJitter
 from sitl.linkspec import MAX_RATE_BPS, MAX_TIME_NS, PRESETS, format_spec, parse_link, parse_spec
 from tests.sitl.links import MS, S, flights_ns
 
@@ -58,8 +58,26 @@ def test_spaces_around_items_are_ignored_and_blackouts_repeat():
     assert spec == LinkSpec(delay_ns=MS, blackouts=((S, S), (4 * S, S // 2)))
 
 
+@pytest.mark.parametrize(
+    ("text", "loss"),
+    [
+        ("ge:0.02:0.18", GilbertElliott(0.02, 0.18, bad=1.0, good=0.0)),
+        ("ge:0.02:0.18:0.9", GilbertElliott(0.02, 0.18, bad=0.9, good=0.0)),
+        ("ge:0.02:0.18:0.9:0.01", GilbertElliott(0.02, 0.18, bad=0.9, good=0.01)),
+        ("ge:0.02:0.18:1.0:0.01", GilbertElliott(0.02, 0.18, good=0.01)),
+        ("ge:0.0:0.0", GilbertElliott(0.0, 0.0)),
+        ("ge:1.0:1.0:0.0:1.0", GilbertElliott(1.0, 1.0, 0.0, 1.0)),
+    ],
+)
+def test_a_loss_model_is_its_name_and_parameters_without_trailing_defaults(text, loss):
+    assert parse_spec(f"loss={text}") == LinkSpec(loss=loss)
+    assert format_spec(LinkSpec(loss=loss)) == f"loss={text}"
+
+
 TIME = "expected a time with its unit (s, ms, us, ns) up to 1000000s, found"
 PROBABILITY = "expected a probability from 0 to 1, found"
+LOSS = "loss: expected a probability from 0 to 1 or ge:P:R[:BAD[:GOOD]], found"
+BURSTY = "loss: expected ge:P:R[:BAD[:GOOD]], each a probability from 0 to 1, found"
 RATE = f"expected a rate above 0 with its unit (Mbps, kbps, bps) up to {MAX_RATE_BPS}bps, found"
 JITTER = "expected one of uniform:…, normal:…, gamma:…, as in uniform:28ms, found"
 
@@ -67,11 +85,25 @@ JITTER = "expected one of uniform:…, normal:…, gamma:…, as in uniform:28ms
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("loss=2", f"loss: {PROBABILITY} 2"),
-        ("loss=-0.1", f"loss: {PROBABILITY} -0.1"),
-        ("loss=nan", f"loss: {PROBABILITY} nan"),
-        ("loss=0_1", f"loss: {PROBABILITY} 0_1"),
-        ("loss=٠.٥", f"loss: {PROBABILITY} ٠.٥"),
+        ("loss=2", f"{LOSS} 2"),
+        ("loss=-0.1", f"{LOSS} -0.1"),
+        ("loss=nan", f"{LOSS} nan"),
+        ("loss=0_1", f"{LOSS} 0_1"),
+        ("loss=٠.٥", f"{LOSS} ٠.٥"),
+        ("loss=", f"{LOSS} nothing"),
+        ("loss=0.1:0.2", f"{LOSS} 0.1:0.2"),
+        ("loss=gilbert:0.1:0.2", f"{LOSS} gilbert:0.1:0.2"),
+        ("loss=GE:0.1:0.2", f"{LOSS} GE:0.1:0.2"),
+        ("loss=ge", f"{BURSTY} ge"),
+        ("loss=ge:0.1", f"{BURSTY} ge:0.1"),
+        ("loss=ge:0.1:", f"{BURSTY} ge:0.1:"),
+        ("loss=ge:0.1:1.5", f"{BURSTY} ge:0.1:1.5"),
+        ("loss=ge:-0.1:0.5", f"{BURSTY} ge:-0.1:0.5"),
+        ("loss=ge:2%:18%", f"{BURSTY} ge:2%:18%"),
+        ("loss=ge:0.1:0.2:nan", f"{BURSTY} ge:0.1:0.2:nan"),
+        ("loss=ge:0.1:0.2:1:0:0", f"{BURSTY} ge:0.1:0.2:1:0:0"),
+        ("loss=0.1,loss=ge:0.1:0.2", "loss: expected once, found again with ge:0.1:0.2"),
+        ("dup=2", f"dup: {PROBABILITY} 2"),
         ("dup=many", f"dup: {PROBABILITY} many"),
         ("reorder=", f"reorder: {PROBABILITY} nothing"),
         ("delay=25", f"delay: {TIME} 25"),
@@ -105,7 +137,7 @@ def test_a_bad_spec_is_refused_in_one_clear_line(text, message):
     assert str(refusal.value) == f'link spec "{text}": {message}'
 
 
-@given(st.text() | st.from_regex(r"(delay|jitter|loss|rate|blackout)=.*", fullmatch=True))
+@given(st.text() | st.from_regex(r"(delay|jitter|loss|rate|blackout)=(ge:)?.*", fullmatch=True))
 def test_any_text_is_a_spec_or_one_line_of_refusal(text):
     refusal = ""
     try:
@@ -123,7 +155,10 @@ specs = st.builds(
     LinkSpec,
     delay_ns=times,
     jitter=st.none() | st.builds(lambda model, scale: model(scale), st.sampled_from(list(JITTERS.values())), times),
-    loss=probabilities,
+    loss=probabilities
+    | st.builds(
+        GilbertElliott, probabilities, probabilities, st.just(1.0) | probabilities, st.just(0.0) | probabilities
+    ),
     dup=probabilities,
     reorder=probabilities,
     keep_order=st.booleans(),
