@@ -8,6 +8,7 @@ from typing import Literal
 
 import click
 
+from autopilot.alpha import AlphaChoice
 from autopilot.app import AutopilotConfig, AutopilotNode
 from autopilot.link.clock import NS_PER_S, Clock
 from autopilot.link.process import ADDRESS, ProcessOptions, process_options, run_node
@@ -60,12 +61,41 @@ MAX_GROUND_STATIONS = 8
     help="monitor: report transitions, fly the law all the same.",
 )
 @click.option(
+    "--alpha",
+    type=click.Choice(["auto", "aoa_ssa", "vfr_hud"]),
+    default="auto",
+    show_default=True,
+    help="Where the angle of attack comes from; auto: VFR_HUD where no AOA_SSA ever comes.",
+)
+@click.option(
+    "--align/--no-align",
+    default=True,
+    show_default=True,
+    help="Look the reference ahead by the forecast delay.",
+)
+@click.option(
     "--hold",
     "hold_s",
     type=FiniteRange(0.0, 60.0),
     default=0.5,
     show_default=True,
     help="Seconds that failsafe holds the last command before neutral.",
+)
+@click.option(
+    "--saturation",
+    "saturation_s",
+    type=FiniteRange(0.0, 3600.0),
+    default=1.0,
+    show_default=True,
+    help="Seconds that the elevator may stay at its limit before neutral; 0 for ever.",
+)
+@click.option(
+    "--ground-timeout",
+    "ground_timeout_s",
+    type=FiniteRange(0.0, 3600.0),
+    default=0.0,
+    show_default=True,
+    help="Seconds without a ground station, once one was heard, until the reference is eased to zero; 0: never.",
 )
 @click.option("--require-certificate", is_flag=True, help="Refuse gains without a verified certificate.")
 @process_options
@@ -77,7 +107,11 @@ def cli(
     reference: str,
     actuator: Literal["pwm", "float"],
     failsafe: Literal["on", "monitor"],
+    alpha: AlphaChoice,
+    align: bool,
     hold_s: float,
+    saturation_s: float,
+    ground_timeout_s: float,
     require_certificate: bool,
     clock: Clock,
     record: Path | None,
@@ -97,13 +131,19 @@ def cli(
         profile=parse_profile(reference, gains.model.Ts),
         actuator=actuator,
         failsafe=failsafe,
+        alpha=alpha,
+        align=align,
         hold_ns=round(hold_s * NS_PER_S),
+        saturation_ns=round(saturation_s * NS_PER_S),
+        ground_timeout_ns=round(ground_timeout_s * NS_PER_S),
         ground_stations=len(stations),
     )
     node = AutopilotNode(config)
     proof = node.proof
-    if require_certificate and not proof.passed:
-        raise InputError(f"gains {gains.name}: no verified certificate ({proof.reason}), but --require-certificate")
+    for each, verification in ((gains, proof), (gains.conservative, node.conservative_proof)):
+        if require_certificate and each is not None and verification is not None and not verification.passed:
+            reason = f"no verified certificate ({verification.reason}), but --require-certificate"
+            raise InputError(f"gains {each.name}: {reason}")
     openers = [partial(dial, "plant", plant), *(partial(dial, f"gcs{i}", a) for i, a in enumerate(stations))]
     proved = "certificate verified" if proof.passed else "no verified certificate"
     windows = ", ".join(f"{d_min}..{d_max}" for d_min, d_max in node.windows)

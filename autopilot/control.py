@@ -1,6 +1,6 @@
 """The control law, Eq. (9): u(k) = K1 x(k - d(k)) + K2 xr(k), around trim, within the elevator's travel.
 
-Of a schedule's sets of gains, the forecast delay of a command chooses the one that computes it.
+Of a schedule's sets of gains, the forecast of a command's delay chooses the one that computes it.
 
 The law runs once per sample on a handful of numbers, right between a packet in and a packet out. Plain
 floats do that several times faster than arrays, most of all when the processor's caches are cold.
@@ -16,10 +16,13 @@ from autopilot.link.clock import NS_PER_S
 from autopilot.link.servo import Travel, travel_of
 from gains.model import Gains
 
-__all__ = ["ChosenSets", "Law", "SetChanges", "Window", "choose_set", "law_of"]
+__all__ = ["ChosenSets", "Law", "SetChanges", "SetChooser", "Window", "law_of"]
 
 TELL_NS = NS_PER_S
 """Changes of the set in force are told of at most once in this time."""
+
+SETTLE_SAMPLES = 40
+"""A set with a narrower window takes over when it could have for so many samples in a row: 1 s at 25 ms."""
 
 Window = tuple[int, int]
 """d_min and d_max of a set of gains, samples."""
@@ -75,30 +78,76 @@ def law_of(gains: Gains) -> Law:
     return Law(tuple(gains.K1[0].tolist()), K2, tuple(gains.model.trim.x.tolist()), travel)
 
 
-def choose_set(windows: Sequence[Window], present: int, d: int | None) -> int:
-    """Return the index of the set of gains for a command whose delay is forecast as d.
+class SetChooser:
+    """Which of a schedule's sets computes a command, by the interval of its forecast; with hysteresis.
 
-    The present set stays while its window contains d, so that a delay that wanders between two windows does not
-    switch at every sample. Otherwise it is the set whose window has the most room around d, min(d - d_min, d_max - d);
-    of equals the one with the narrower window, and of those the first. An unknown delay, or one that no window
-    contains, changes nothing: failsafe decides there.
+    The set in force stays while its window contains the interval [low, high]. Otherwise the narrowest window that
+    contains it wins, as it has the better gains; of equals the one with more room around the interval, and of those
+    the first. A narrower window than that of the set in force wins only when it has contained SETTLE_SAMPLES
+    intervals in a row, so that a delay that wanders about the edge of a window does not switch all the time.
+
+    An interval too wide for any window leaves the choice to d alone: the set in force while its window contains d,
+    else the one with the most room around d. An unknown delay, or one outside every window, changes nothing;
+    failsafe decides there.
 
     Parameters
     ----------
     windows : sequence of Window
         Of each set, in the order of the schedule; one for plain gains.
+
+    Attributes
+    ----------
     present : int
         Index of the set in force.
-    d : int or None
-        Forecast delay, samples; None when unknown.
     """
-    if d is None:
-        return present
-    d_min, d_max = windows[present]
-    if d_min <= d <= d_max:
-        return present
-    rooms = [(min(d - low, high - d), low - high, -i) for i, (low, high) in enumerate(windows) if low <= d <= high]
-    return -max(rooms)[2] if rooms else present
+
+    def __init__(self, windows: Sequence[Window]) -> None:
+        self.windows = windows
+        self.present = 0
+        self._candidate = 0
+        self._in_a_row = 0
+
+    def choose(self, d: int | None, low: int | None, high: int | None) -> int:
+        """Return the index of the set for a command with this forecast, which is in force from now on."""
+        if len(self.windows) == 1 or d is None or low is None or high is None:
+            return self.present
+        best = self._narrowest(low, high)
+        if best is None:
+            self._in_a_row = 0
+            if not self._contains(self.present, d, d):
+                self.present = self._roomiest(d)
+        elif not self._contains(self.present, low, high):
+            self.present, self._in_a_row = best, 0
+        elif self._width(best) >= self._width(self.present):
+            self._in_a_row = 0
+        else:
+            self._in_a_row = self._in_a_row + 1 if best == self._candidate else 1
+            self._candidate = best
+            if self._in_a_row >= SETTLE_SAMPLES:
+                self.present, self._in_a_row = best, 0
+        return self.present
+
+    def _contains(self, index: int, low: int, high: int) -> bool:
+        d_min, d_max = self.windows[index]
+        return d_min <= low and high <= d_max
+
+    def _width(self, index: int) -> int:
+        d_min, d_max = self.windows[index]
+        return d_max - d_min
+
+    def _room(self, index: int, low: int, high: int) -> int:
+        d_min, d_max = self.windows[index]
+        return min(low - d_min, d_max - high)
+
+    def _narrowest(self, low: int, high: int) -> int | None:
+        """Return the set of the narrowest window that contains the interval."""
+        fit = [i for i in range(len(self.windows)) if self._contains(i, low, high)]
+        return min(fit, key=lambda i: (self._width(i), -self._room(i, low, high), i), default=None)
+
+    def _roomiest(self, d: int) -> int:
+        """Return the set with the most room around d; the present one when no window contains d."""
+        fit = [i for i in range(len(self.windows)) if self._contains(i, d, d)]
+        return min(fit, key=lambda i: (-self._room(i, d, d), self._width(i), i), default=self.present)
 
 
 @dataclass(slots=True)

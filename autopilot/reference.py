@@ -131,6 +131,11 @@ class ReferenceModel:
         """Put the state at sample k elsewhere."""
         self._states = deque([xr])
 
+    def follow(self, profile: Profile) -> None:
+        """Follow another profile from here on; the state stays."""
+        self.profile = profile
+        self.set(self.xr)
+
     def advance(self, j: int) -> Vector:
         """Move the state on to sample j and return xr(j); an earlier sample than the present one moves nothing."""
         while self.k < j and len(self._states) > 1:

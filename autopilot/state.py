@@ -2,7 +2,12 @@
 
 ``[sensors]`` of the model file says which MAVLink field carries each state. ATTITUDE comes on a 1 ms
 grid, AOA_SSA in microseconds; two halves belong together when their stamps differ by less than half a
-sampling period. A sample is complete when every message that carries a state has come.
+sampling period. A sample is complete when every message that carries a state has come. Where the angle of
+attack is taken from VFR_HUD (``alpha.py``), ATTITUDE alone makes a sample.
+
+ATTITUDE's u32 milliseconds wrap after 49.7 days. Some vehicles fill the u64 of AOA_SSA from a u32 counter
+(ArduPlane: ``micros()``), so that a value that fits one wraps after 71.6 minutes. Both are taken as near as
+can be to the plant's time, or to the newest stamp while that is not known, and never before 0.
 
 The plant numbers its samples: NAMED_VALUE_INT ``SAMPLE_K`` gives k at a stamp. Samples wait for the
 first number, so that j means the same sample on both ends although the first ones may be lost; a plant
@@ -12,13 +17,13 @@ that sends none is numbered from the first sample seen.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 
+from autopilot.alpha import AlphaChoice, AlphaSource, alpha_selector
 from autopilot.link.clock import NS_PER_MS, NS_PER_S, NS_PER_US, unwrap
 from autopilot.link.sensors import Measurement, sensors_of
-from autopilot.link.wire import AoaSsa
+from autopilot.link.wire import AoaSsa, Attitude, VfrHud
 from gains.model import Model
 
 __all__ = ["JUMP_BACK_NS", "Drop", "Sample", "SampleAssembler"]
@@ -32,9 +37,12 @@ NUMBER_WAIT_NS = 5 * NS_PER_S // 2
 JUMP_BACK_NS = NS_PER_S
 """A stamp older than the newest by more than this is no reordering but, with a clock step, a restart."""
 
-
 FUTURE_SLACK_NS = NS_PER_S
 """A stamp may be later than the plant's time by this much, beyond the bound of the clock estimate."""
+
+U32 = 1 << 32
+TURN_NS = U32 * NS_PER_MS
+"""The time after which ATTITUDE's stamps repeat."""
 
 
 class Drop(StrEnum):
@@ -45,6 +53,8 @@ class Drop(StrEnum):
     JUMPED_BACK = "jumped_back"
     FROM_THE_FUTURE = "from_the_future"
     HALF = "half"
+    NO_AIR = "no_air"
+    """No VFR_HUD to take the angle of attack from: none has come of late, or it is too slow."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,12 +71,15 @@ class Sample:
         The state, absolute, in the model's units.
     parts : tuple of Attitude or AoaSsa
         The messages it was made of.
+    alpha : AlphaSource
+        Where its angle of attack came from. VFR_HUD is the noisy one.
     """
 
     j: int
     t_ns: int
     x: tuple[float, ...]
     parts: tuple[Measurement, ...]
+    alpha: AlphaSource
 
 
 @dataclass(slots=True)
@@ -77,6 +90,12 @@ class _Pending:
     parts: dict[type[Measurement], Measurement]
 
 
+def _nearest(value: int, near: int, modulus: int) -> int:
+    """Return the number congruent to ``value`` nearest to ``near``, but none below 0: no clock was there."""
+    nearest = unwrap(value, near, modulus)
+    return nearest if nearest >= 0 else nearest + modulus
+
+
 class SampleAssembler:
     """Pairs, orders, de-duplicates and numbers the measurements of one plant.
 
@@ -84,6 +103,8 @@ class SampleAssembler:
     ----------
     model : Model
         Its sensors and sampling period.
+    alpha : "auto", "aoa_ssa" or "vfr_hud"
+        Where the angle of attack comes from, if the model has one.
 
     Attributes
     ----------
@@ -92,23 +113,50 @@ class SampleAssembler:
     newest_ns : int or None
         Stamp of the newest complete sample.
     needed : frozenset of type
-        The messages that carry a state.
+        The messages that carry a state: those that :meth:`add` takes.
     jumped_back : bool
         Whether the last stamp was older than the newest sample by more than JUMP_BACK_NS.
+
+    Raises
+    ------
+    InputError
+        When the model cannot be flown over these messages, or its state not without AOA_SSA as was asked for.
     """
 
-    def __init__(self, model: Model) -> None:
+    def __init__(self, model: Model, alpha: AlphaChoice = "auto") -> None:
         self.drops: Counter[Drop] = Counter()
         self.newest_ns: int | None = None
         self.jumped_back = False
         self._Ts_ns = model.Ts_ns
         self._sensors = sensors_of(model)
+        self._alpha = alpha_selector(self._sensors, alpha, model.name)
         self.needed = frozenset(sensor.message for sensor in self._sensors)
+        if alpha == "vfr_hud":
+            self.needed -= {AoaSsa}
         self._pending: list[_Pending] = []
         self._number: tuple[int, int] | None = None
-        self._waiting: tuple[int, Mapping[type[Measurement], Measurement]] | None = None
+        self._waiting: Sample | None = None
+        """The newest complete sample, whose number is not known yet."""
         self._first: tuple[int, int] | None = None
         """Own time and stamp of the first complete sample of the epoch."""
+        self._seen_ns: int | None = None
+        """The last stamp of the epoch, of whatever message."""
+        self._settled = False
+        """Whether the stamps kept are on the plant's time, rather than right up to turns of the counter."""
+
+    @property
+    def alpha(self) -> AlphaSource:
+        """Where the angle of attack of the next sample will come from."""
+        return self._alpha.source
+
+    @property
+    def alpha_since_ns(self) -> int | None:
+        """Own time at which that source was changed to; None while it never was."""
+        return self._alpha.since_ns
+
+    def alpha_report(self) -> str:
+        """Return what people must know of that source, in at most 50 characters."""
+        return self._alpha.report()
 
     def restart(self) -> None:
         """Begin a new epoch: forget stamps and numbers, keep the counters."""
@@ -118,6 +166,9 @@ class SampleAssembler:
         self._number = None
         self._waiting = None
         self._first = None
+        self._seen_ns = None
+        self._settled = False
+        self._alpha.restart()
 
     def forget_number(self) -> None:
         """Wait for the plant's next number: its clock has stepped, and stamps do not count samples across that."""
@@ -137,10 +188,13 @@ class SampleAssembler:
             The plant's time now, at the most; a stamp well after it is refused.
         """
         assert type(message) in self.needed, type(message)
+        if peer_ns is not None and not self._settled:
+            self._settle(peer_ns)
         t_ns = self._stamp_ns(message, peer_ns)
         if peer_ns is not None and t_ns > peer_ns + FUTURE_SLACK_NS:
             self.drops[Drop.FROM_THE_FUTURE] += 1
             return None
+        self._note(message, t_ns, now_ns)
         half_ns = self._Ts_ns // 2
         if self.newest_ns is not None:
             self.jumped_back = t_ns < self.newest_ns - JUMP_BACK_NS
@@ -149,16 +203,27 @@ class SampleAssembler:
                 kind = Drop.JUMPED_BACK if self.jumped_back else Drop.LATE if late else Drop.DUPLICATE
                 self.drops[kind] += 1
                 return None
+        alpha_rad = None
+        if self._alpha.source is AlphaSource.VFR_HUD and isinstance(message, Attitude):
+            alpha_rad = self._alpha.alpha_rad(message.pitch, now_ns)
+            if alpha_rad is None:
+                self.drops[Drop.NO_AIR] += 1
+                return None
         complete = self._pair(message, t_ns, half_ns)
-        return self._numbered(complete, now_ns) if complete is not None else None
+        return self._numbered(self._whole(complete, alpha_rad), now_ns) if complete is not None else None
+
+    def air(self, message: VfrHud, now_ns: int) -> None:
+        """Take a VFR_HUD, from which the angle of attack may have to come."""
+        self._alpha.air(message, now_ns)
 
     def number(self, k: int, time_boot_ms: int, peer_ns: int | None = None) -> Sample | None:
         """Take the plant's number k of the sample stamped ``time_boot_ms``; return a sample that waited for it."""
-        self._number = (k, self._unwrap_ms(time_boot_ms, peer_ns))
-        if self._waiting is None:
-            return None
+        if peer_ns is not None and not self._settled:
+            self._settle(peer_ns)
+        self._seen_ns = at_ns = self._unwrap_ms(time_boot_ms, peer_ns)
+        self._number = (k, at_ns)
         waiting, self._waiting = self._waiting, None
-        return self._sample(*waiting)
+        return self._counted(waiting) if waiting is not None else None
 
     def command_of(self, time_boot_ms: int, d: int) -> int | None:
         """Return the sample j of the command that a reported delay d speaks of; None before samples are numbered."""
@@ -167,17 +232,58 @@ class SampleAssembler:
         k, at_ns = self._number
         return k + round((self._unwrap_ms(time_boot_ms, None) - at_ns) / self._Ts_ns) - d
 
+    # Stamps
+
+    def _note(self, message: Measurement, t_ns: int, now_ns: int) -> None:
+        """Note that a message has come, and what its stamp tells of the plant's time."""
+        self._seen_ns = t_ns
+        if isinstance(message, Attitude):
+            self._alpha.attitude(now_ns)
+            return
+        self._alpha.angle(now_ns)
+        if self.newest_ns is None and not self._settled:
+            self._move(t_ns)
+
     def _stamp_ns(self, message: Measurement, peer_ns: int | None) -> int:
-        if isinstance(message, AoaSsa):
+        if not isinstance(message, AoaSsa):
+            return self._unwrap_ms(message.time_boot_ms, peer_ns)
+        near_ns = self._near_ns(peer_ns)
+        if message.time_usec >= U32 or near_ns is None:
             return message.time_usec * NS_PER_US
-        return self._unwrap_ms(message.time_boot_ms, peer_ns)
+        return _nearest(message.time_usec, near_ns // NS_PER_US, U32) * NS_PER_US
 
     def _unwrap_ms(self, time_boot_ms: int, peer_ns: int | None) -> int:
-        """Return a stamp in ns: the one nearest to the newest sample, or to the plant's time before there is one."""
-        near_ns = self.newest_ns if self.newest_ns is not None else peer_ns
+        """Return a stamp in ns, in the turn of the counter that is nearest to the plant's time."""
+        near_ns = self._near_ns(peer_ns)
         if near_ns is not None:
-            time_boot_ms = unwrap(time_boot_ms, near_ns // NS_PER_MS, 1 << 32)
+            time_boot_ms = _nearest(time_boot_ms, near_ns // NS_PER_MS, U32)
         return time_boot_ms * NS_PER_MS
+
+    def _near_ns(self, peer_ns: int | None) -> int | None:
+        """Return the plant's time as well as it is known: its clock, else the newest sample, else any stamp."""
+        if peer_ns is not None:
+            return peer_ns
+        return self.newest_ns if self.newest_ns is not None else self._seen_ns
+
+    def _settle(self, peer_ns: int) -> None:
+        """Now that the plant's time is known, move what was stamped before to it."""
+        self._settled = True
+        self._move(peer_ns)
+
+    def _move(self, near_ns: int) -> None:
+        """Move every stamp by the turns of the counter that bring it nearest to ``near_ns``."""
+        for pending in self._pending:
+            pending.t_ns = _nearest(pending.t_ns, near_ns, TURN_NS)
+        if self.newest_ns is not None:
+            self.newest_ns = _nearest(self.newest_ns, near_ns, TURN_NS)
+        if self._number is not None:
+            self._number = (self._number[0], _nearest(self._number[1], near_ns, TURN_NS))
+        if self._first is not None:
+            self._first = (self._first[0], _nearest(self._first[1], near_ns, TURN_NS))
+        if self._waiting is not None:
+            self._waiting = replace(self._waiting, t_ns=_nearest(self._waiting.t_ns, near_ns, TURN_NS))
+
+    # Samples
 
     def _pair(self, message: Measurement, t_ns: int, half_ns: int) -> _Pending | None:
         """Put a measurement with its other half; return the sample's parts when all are there."""
@@ -187,6 +293,8 @@ class SampleAssembler:
                     self.drops[Drop.DUPLICATE] += 1
                     return None
                 pending.parts[type(message)] = message
+                if isinstance(message, AoaSsa):
+                    pending.t_ns = t_ns  # the finer of the two
                 break
         else:
             pending = _Pending(t_ns, {type(message): message})
@@ -195,7 +303,7 @@ class SampleAssembler:
                 oldest = min(self._pending, key=lambda p: p.t_ns)
                 self._pending.remove(oldest)
                 self.drops[Drop.HALF] += len(oldest.parts)
-        if len(pending.parts) < len(self.needed):
+        if len(pending.parts) < (1 if self._alpha.source is AlphaSource.VFR_HUD else len(self.needed)):
             return None
         for older in [p for p in self._pending if p.t_ns <= pending.t_ns]:
             self._pending.remove(older)
@@ -203,25 +311,33 @@ class SampleAssembler:
                 self.drops[Drop.HALF] += len(older.parts)
         return pending
 
-    def _numbered(self, complete: _Pending, now_ns: int) -> Sample | None:
+    def _whole(self, complete: _Pending, alpha_rad: float | None) -> Sample:
+        """Return the sample that is complete, not numbered yet; with ``alpha_rad`` where AOA_SSA is not its part."""
+        parts = complete.parts
+        x = [
+            getattr(parts[sensor.message], sensor.field) / sensor.to_field
+            if alpha_rad is None or sensor.message is Attitude
+            else alpha_rad
+            for sensor in self._sensors
+        ]
+        return Sample(0, complete.t_ns, tuple(x), tuple(parts.values()), self._alpha.source)
+
+    def _numbered(self, whole: Sample, now_ns: int) -> Sample | None:
         """Return a complete sample with its number, or keep it until there is one."""
-        finest = complete.parts.get(AoaSsa)
-        t_ns = complete.t_ns if finest is None else self._stamp_ns(finest, None)
-        self.newest_ns = t_ns
+        self.newest_ns = whole.t_ns
         if self._number is None:
             if self._first is None:
-                self._first = (now_ns, t_ns)
+                self._first = (now_ns, whole.t_ns)
             since_ns, first_ns = self._first
             if now_ns - since_ns < NUMBER_WAIT_NS:
-                self._waiting = (t_ns, complete.parts)
+                self._waiting = whole
                 return None
             self._number = (0, first_ns)
-        return self._sample(t_ns, complete.parts)
+        return self._counted(whole)
 
-    def _sample(self, t_ns: int, parts: Mapping[type[Measurement], Measurement]) -> Sample:
-        """Return the sample stamped ``t_ns``, numbered; stamps are good to a millisecond."""
+    def _counted(self, whole: Sample) -> Sample:
+        """Return the sample with its number; stamps are good to a millisecond."""
         assert self._number is not None
         k, at_ns = self._number
-        j = k + round((t_ns - at_ns) / self._Ts_ns)
-        x = [getattr(parts[sensor.message], sensor.field) / sensor.to_field for sensor in self._sensors]
-        return Sample(j, t_ns, tuple(x), tuple(parts.values()))
+        j = k + round((whole.t_ns - at_ns) / self._Ts_ns)
+        return Sample(j, whole.t_ns, whole.x, whole.parts, whole.alpha)

@@ -15,6 +15,7 @@ from autopilot.link.wire import (
     AoaSsa,
     Attitude,
     Message,
+    NamedValueFloat,
     NamedValueInt,
     ServoOutputRaw,
     Severity,
@@ -69,12 +70,18 @@ class Vehicle:
         assert len(self.banner) <= MAX_BANNER
         self.wires = {port: Wire(AUTOPILOT, None) for port in self.ports}
 
-    def receive(self, port: str, datagram: bytes) -> None:
-        """Take a ground station's datagram. Its commands are not served yet; they are counted by the wire."""
-        if self.wires[port].decode(datagram) and port not in self._heard:
+    def receive(self, port: str, datagram: bytes) -> bool:
+        """Take a ground station's datagram; return whether it is one.
+
+        Its commands are not served yet; they are counted by the wire.
+        """
+        if not self.wires[port].decode(datagram):
+            return False
+        if port not in self._heard:
             self._heard.add(port)
             for text in self.banner:
                 self._out.append((port, self.wires[port].encode(text)))
+        return True
 
     def tick(self, now_ns: int, *, tracking: bool, degraded: bool) -> None:
         """Send what waits, and the heartbeat when it is due, with the banner before the first one."""
@@ -95,7 +102,7 @@ class Vehicle:
 
     def show(self, message: Message, now_ns: int) -> None:
         """Repeat a message under our name, on our clock, at the next tick."""
-        if isinstance(message, Attitude | NamedValueInt):
+        if isinstance(message, Attitude | NamedValueFloat | NamedValueInt):
             message = replace(message, time_boot_ms=now_ns // NS_PER_MS)
         elif isinstance(message, AoaSsa | ServoOutputRaw):
             message = replace(message, time_usec=now_ns // NS_PER_US)
@@ -121,8 +128,18 @@ class Vehicle:
         return out
 
 
-def banner(gains: GainLaw, proof: Verification) -> list[StatusText]:
-    """Return what a ground station must know at start: whether what flies is proved, and the windows of a schedule."""
+def banner(gains: GainLaw, proof: Verification, conservative: Verification | None = None) -> list[StatusText]:
+    """Return what a ground station must know at start: what of it all is proved, and the windows of a schedule.
+
+    Parameters
+    ----------
+    gains : Gains or Schedule
+        What flies.
+    proof : Verification
+        Of its certificate.
+    conservative : Verification, optional
+        Of the certificate of its conservative gains.
+    """
     what = f"{'schedule' if isinstance(gains, Schedule) else 'gains'} {gains.name}"
     if proof.passed:
         fifo = gains.certificate is not None and gains.certificate.get("transitions") == "fifo"
@@ -134,4 +151,9 @@ def banner(gains: GainLaw, proof: Verification) -> list[StatusText]:
         text = f"{len(gains.sets)} gain sets: delay {windows}"
         overall = f"{len(gains.sets)} gain sets: delay {gains.d_min} to {gains.d_max}"
         texts.append(StatusText(Severity.INFO, text if len(text) <= MAX_TEXT else overall))
+    wide = gains.conservative
+    if wide is not None and conservative is not None:
+        severity = Severity.INFO if conservative.passed else Severity.WARNING
+        unproved = "" if conservative.passed else ", no certificate"
+        texts.append(StatusText(severity, f"conservative {wide.name}: delay {wide.d_min} to {wide.d_max}{unproved}"))
     return texts

@@ -57,7 +57,8 @@ def list_(as_json: bool) -> None:
 def show(name: str, as_json: bool) -> None:
     """Show the model, the gains or the schedule NAME.
 
-    A model is shown discrete at its sampling period, whatever the file holds.
+    A model is shown discrete at its sampling period, whatever the file holds. Certificates are verified, also that of
+    the conservative gains that a gain file names.
     """
     item = load(name)
     if as_json:
@@ -112,7 +113,12 @@ def _law_json(law: GainLaw) -> dict[str, object]:
         "d_max": law.d_max,
         **({"window": [_fields(gains, *_SET) for gains in sets_of(law)]} if scheduled else _fields(law, "K1", "K2")),
         "certificate": _certificate(law),
+        "conservative": None if law.conservative is None else _conservative_json(law.conservative),
     }
+
+
+def _conservative_json(gains: Gains) -> dict[str, object]:
+    return {**_fields(gains, "name", *_SET), "certificate": _certificate(gains)}
 
 
 def _fields(item: object, *names: str) -> dict[str, object]:
@@ -186,6 +192,10 @@ def _show_law(console: Console, law: GainLaw) -> None:
     else:
         _show_gains(console, law)
     console.print(f"certificate: {_certificate(law)}", soft_wrap=True)
+    if law.conservative is not None:
+        gains = law.conservative
+        proof = f"certificate {_certificate(gains)}"
+        console.print(f"conservative: {gains.name}, {_window(gains)}, {proof}", soft_wrap=True)
 
 
 def _show_gains(console: Console, gains: Gains) -> None:
@@ -220,10 +230,13 @@ def _model_line(model: Model) -> str:
 
 
 def _law_line(law: GainLaw) -> str:
-    low, high = (d * law.model.Ts * 1e3 for d in (law.d_min, law.d_max))
-    window = f"delay {law.d_min} to {law.d_max} samples ({low:g} to {high:g} ms)"
     sets = f", schedule of {_count(len(law.sets), 'set')}" if isinstance(law, Schedule) else ""
-    return f"for {law.model.name}, {window}{sets}"
+    return f"for {law.model.name}, {_window(law)}{sets}"
+
+
+def _window(law: GainLaw) -> str:
+    low, high = (d * law.model.Ts * 1e3 for d in (law.d_min, law.d_max))
+    return f"delay {law.d_min} to {law.d_max} samples ({low:g} to {high:g} ms)"
 
 
 def _certificate(gains: GainLaw) -> str:

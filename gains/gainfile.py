@@ -2,15 +2,18 @@
 
 :mod:`gains.store` finds the file and its model. The certificate of a schedule speaks of all switching between its
 sets; either kind is refused here when its model, its gains or the certificate itself have changed since the proof.
+The conservative gains that a file may name are proved by a certificate of their own, and no part of this one.
 """
 
 from __future__ import annotations
 
+import numpy as np
+
 from gains.certificate import claim_hash, law_hash, model_hash
 from gains.model import GainLaw, Gains, Matrix, Model, Schedule
-from gains.table import Table
+from gains.table import InputError, Table
 
-__all__ = ["DELAY_LIMIT", "content_of", "read_gains", "read_schedule"]
+__all__ = ["DELAY_LIMIT", "check_conservative", "content_of", "read_gains", "read_schedule"]
 
 DELAY_LIMIT = 1000  # samples; buffers in the loop grow with d_max
 
@@ -45,9 +48,42 @@ def read_schedule(table: Table, name: str, model: Model) -> Schedule:
     return schedule
 
 
-def content_of(law: GainLaw, model: str) -> dict[str, object]:
-    """Return what a gain file says, for writing: numbers at full double precision, the model by the name given."""
+def check_conservative(source: str, law: GainLaw) -> None:
+    """Refuse conservative gains for another model than the law's, or for a window that is not wider and around its.
+
+    Raises
+    ------
+    InputError
+        Naming the file ``source`` of the law, what was expected and what was found.
+    """
+    gains = law.conservative
+    if gains is None:
+        return
+    expected = found = ""
+    if not _same_model(gains.model, law.model):
+        expected = f"gains for the same model ({law.model.name}: Ts, states, trim and matrices)"
+        found = f"{gains.name}, for another ({gains.model.name})"
+    elif not (gains.d_min <= law.d_min and law.d_max < gains.d_max):
+        expected = f"gains for delays from {law.d_min} or less to {law.d_max + 1} or more"
+        found = f"{gains.name}, for {gains.d_min} to {gains.d_max}"
+    if expected:
+        raise InputError(f"{source}: conservative: expected {expected}, found {found}")
+
+
+def content_of(law: GainLaw, model: str, conservative: str | None) -> dict[str, object]:
+    """Return what a gain file says, for writing.
+
+    Parameters
+    ----------
+    law : Gains or Schedule
+        Every number is written at full double precision.
+    model : str
+        What the file calls the model.
+    conservative : str or None
+        What the file calls the conservative gains; None if it names none.
+    """
     content: dict[str, object] = {"name": law.name, "model": model}
+    content |= {} if conservative is None else {"conservative": conservative}
     if isinstance(law, Schedule):
         content["window"] = [_set_content(gains) for gains in law.sets]
     else:
@@ -75,6 +111,14 @@ def _matrices(table: Table, model: Model) -> tuple[Matrix, Matrix | None]:
     if "K2" in table:
         raise table.error("K2", f"none, as model {model.name} has no [reference]", "one")
     return K1, None
+
+
+def _same_model(one: Model, other: Model) -> bool:
+    """Tell whether a law for one model, with its proof, is one for the other; names do not count."""
+    if one is other:
+        return True
+    at_one_trim = np.array_equal(one.trim.x, other.trim.x) and np.array_equal(one.trim.u, other.trim.u)
+    return one.states == other.states and at_one_trim and model_hash(one) == model_hash(other)
 
 
 def _check_hashes(source: str, law: GainLaw, gains: str) -> None:

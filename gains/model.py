@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from itertools import pairwise
+from pathlib import Path
 from typing import TypeAlias
 
 import numpy as np
@@ -251,6 +252,11 @@ class Gains:
         None where the model has no reference.
     certificate : Mapping[str, object] or None
         The file's table as it is: nothing here has been verified.
+    conservative : Gains or None
+        Gains for the same model and a wider window around this one, to fly when the delay leaves this one. They have
+        a certificate of their own, and no conservative gains.
+    conservative_file : Path or None
+        The file of the conservative gains, for naming it again; of no meaning without them.
     """
 
     name: str
@@ -260,9 +266,12 @@ class Gains:
     K1: Matrix
     K2: Matrix | None = None
     certificate: Mapping[str, object] | None = None
+    conservative: Gains | None = None
+    conservative_file: Path | None = None
 
     def __post_init__(self) -> None:
         _freeze(self)
+        assert self.conservative is None or self.conservative.conservative is None
         assert 0 <= self.d_min <= self.d_max
         assert self.K1.shape == (self.model.nu, self.model.nx)
         assert (self.K2 is None) == (self.model.reference is None)
@@ -279,18 +288,25 @@ class Schedule:
     model : Model
     sets : tuple of Gains
         At least one, without certificates. d_min and d_max rise from each to the next, so that no window lies in
-        another, and no delay between the first d_min and the last d_max is left out.
+        another, and no delay between the first d_min and the last d_max is left out. What one of them has for
+        conservative gains is not the schedule's.
     certificate : Mapping[str, object] or None
         The file's table as it is, over all switching between the sets: nothing here has been verified.
+    conservative : Gains or None
+        As of :class:`Gains`: for a wider window around all the schedule's.
+    conservative_file : Path or None
     """
 
     name: str
     model: Model
     sets: tuple[Gains, ...]
     certificate: Mapping[str, object] | None = None
+    conservative: Gains | None = None
+    conservative_file: Path | None = None
 
     def __post_init__(self) -> None:
         assert self.sets
+        assert self.conservative is None or self.conservative.conservative is None
         assert all(gains.model is self.model and gains.certificate is None for gains in self.sets)
         for before, after in pairwise(self.sets):
             assert before.d_min < after.d_min <= before.d_max + 1 <= after.d_max

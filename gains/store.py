@@ -1,6 +1,7 @@
 """Model and gain files: find by name or path, read, check every field and shape.
 
 A name that :func:`stored` lists stands for the file that comes with the program; anything else is a path.
+Names and paths inside a file are the same; its paths start at its own folder.
 The quantities of [reference] and [uncertainty] are discrete at Ts, also where the plant is continuous.
 """
 
@@ -11,6 +12,7 @@ import difflib
 import os
 import re
 import tempfile
+from dataclasses import replace
 from importlib import resources
 from pathlib import Path
 from typing import Literal, NamedTuple
@@ -18,7 +20,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 import tomli_w
 
-from gains.gainfile import DELAY_LIMIT, content_of, read_gains, read_schedule
+from gains.gainfile import DELAY_LIMIT, check_conservative, content_of, read_gains, read_schedule
 from gains.model import (
     Actuator,
     Condition,
@@ -106,7 +108,7 @@ def load_model(name_or_path: str | Path) -> Model:
 
 
 def load_gains(name_or_path: str | Path) -> Gains:
-    """Return the one set of gains of a file together with the model it names.
+    """Return the one set of gains of a file together with the model and the conservative gains it names.
 
     Raises
     ------
@@ -117,7 +119,7 @@ def load_gains(name_or_path: str | Path) -> Gains:
 
 
 def load_law(name_or_path: str | Path) -> GainLaw:
-    """Return the gains or the schedule of a file together with the model it names.
+    """Return the gains or the schedule of a file together with the model and the conservative gains it names.
 
     Raises
     ------
@@ -176,14 +178,17 @@ def parse_gains(table: Table) -> Gains:
 
 
 def parse_law(table: Table) -> GainLaw:
-    """Return the gains or the schedule that the table of a whole file describes, with the model."""
-    if _kind(table) != "gains":
-        raise InputError(f"{table.source}: expected a gain file (model, K1), found a model file")
-    name = table.string("name")
-    model = parse_model(Table.load(_model_path(table)))
-    law = (read_schedule if "window" in table else read_gains)(table, name, model)
+    """Return the gains or the schedule that the table of a whole file describes, with what else it names."""
+    law = _parse_alone(table)
+    named = table.string("conservative", None)
     table.finish()
-    return law
+    if named is None:
+        return law
+    file = _named_path(table, "conservative")
+    gains = _parse_conservative(table, file)
+    check_conservative(table.source, replace(law, conservative=gains))
+    # one object for both models, which agree in all that either law and its proof speak of
+    return replace(law, conservative=replace(gains, model=law.model), conservative_file=file)
 
 
 def model_path(gains_name_or_path: str | Path) -> Path:
@@ -194,7 +199,7 @@ def model_path(gains_name_or_path: str | Path) -> Path:
     InputError
         When there is no such file, or it names none.
     """
-    return _model_path(Table.load(resolve(gains_name_or_path)))
+    return _named_path(Table.load(resolve(gains_name_or_path)), "model")
 
 
 def save_gains(path: str | Path, gains: GainLaw, model: str | Path) -> None:
@@ -206,12 +211,20 @@ def save_gains(path: str | Path, gains: GainLaw, model: str | Path) -> None:
     gains : Gains or Schedule
         Every number is written at full double precision.
     model : str or Path
-        The stored name or the file of the model; the file names it relative to itself.
+        The stored name or the file of the model; the file names it, as the conservative gains, relative to itself.
+
+    Raises
+    ------
+    InputError
+        When the conservative gains do not fit, or the file would replace theirs; nothing is written.
     """
-    path, file = Path(path), resolve(model)
-    stored_names = {stored_file: name for name, stored_file in _stored_paths().items()}
-    reference = stored_names.get(file) or os.path.relpath(file.resolve(), path.resolve().parent)
-    content = content_of(gains, reference)
+    path, conservative = Path(path), None
+    if gains.conservative is not None:
+        assert gains.conservative_file is not None
+        check_conservative(str(path), gains)
+        _require_other(str(path), gains.conservative_file)
+        conservative = _name_for(gains.conservative_file, path)
+    content = content_of(gains, _name_for(resolve(model), path), conservative)
     handle, temporary = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
     try:
         with os.fdopen(handle, "wb") as out:
@@ -226,12 +239,51 @@ def save_gains(path: str | Path, gains: GainLaw, model: str | Path) -> None:
         raise
 
 
-def _model_path(table: Table) -> Path:
+def _parse_alone(table: Table) -> GainLaw:
+    """Return the gains or the schedule of a file with the model, without the conservative gains that it may name."""
+    if _kind(table) != "gains":
+        raise InputError(f"{table.source}: expected a gain file (model, K1), found a model file")
+    name = table.string("name")
+    model = parse_model(Table.load(_named_path(table, "model")))
+    return (read_schedule if "window" in table else read_gains)(table, name, model)
+
+
+def _parse_conservative(table: Table, file: Path) -> Gains:
+    """Return the gains of the file that a table names as conservative: one set, and the end of the chain."""
+    named = Table.load(file)
+    _require_other(table.source, file)
+    name, one_set = table.string("conservative"), "one set of gains (d_min, d_max, K1)"
+    if _kind(named) != "gains":
+        raise table.error("conservative", one_set, f"{name}, a model")
+    if "window" in named:
+        raise table.error("conservative", one_set, f"{name}, a schedule")
+    if "conservative" in named:
+        raise table.error("conservative", "gains without conservative ones of their own", f"{name}, which has some")
+    gains = _parse_alone(named)
+    named.finish()
+    assert isinstance(gains, Gains)
+    return gains
+
+
+def _require_other(source: str, file: Path) -> None:
+    """Refuse gains that are their own conservative ones."""
+    if file.resolve() == Path(source).resolve():
+        raise InputError(f"{source}: conservative: expected another file, found this one")
+
+
+def _named_path(table: Table, key: str) -> Path:
+    """Return the file that a key of a gain file names, by a stored name or a path relative to the file."""
     try:
-        return resolve(table.string("model"), table.folder)
+        return resolve(table.string(key), table.folder)
     except InputError as error:
         prefix = f"{table.source}: "
-        raise InputError(str(error) if str(error).startswith(prefix) else f"{prefix}model: {error}") from None
+        raise InputError(str(error) if str(error).startswith(prefix) else f"{prefix}{key}: {error}") from None
+
+
+def _name_for(file: Path, path: Path) -> str:
+    """Return what a file at ``path`` shall call another: its stored name, or its path relative to that file."""
+    stored_names = {stored_file: name for name, stored_file in _stored_paths().items()}
+    return stored_names.get(file) or os.path.relpath(file.resolve(), path.resolve().parent)
 
 
 def _stored_paths() -> dict[str, Path]:

@@ -87,6 +87,7 @@ def _square(text: str) -> SquareDelta:
 @click.option("--x0", help="State at k = 0, comma-separated; trim by default.")
 @click.option("--gust", "gust_s", type=FiniteRange(0.0), help="The gust of Eq. (52), from this time in s on.")
 @click.option("--uncertainty", help="Delta(k) of Eq. (51) as AMPLITUDE:HALF_PERIOD, for example 0.15:20.")
+@click.option("--no-aoa", is_flag=True, help="Send no AOA_SSA, as many vehicles do not.")
 @process_options
 def plant(
     plant_name: str,
@@ -97,6 +98,7 @@ def plant(
     x0: str | None,
     gust_s: float | None,
     uncertainty: str | None,
+    no_aoa: bool,
     **process: Any,
 ) -> None:
     """Fly an aircraft: integrate, sense, take the elevator from the network. Runs until Ctrl-C."""
@@ -115,6 +117,7 @@ def plant(
         None if uncertainty is None else _square(uncertainty),
         latch,
         servo_timeout or None,
+        not no_aoa,
     )
     openers = [partial(listen, "autopilot", address, peer=peer, accept=frames_of(AUTOPILOT))]
     metadata = {"program": "sitl plant", "plant": plant_name, "lagproof": version()}

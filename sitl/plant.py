@@ -84,6 +84,8 @@ class PlantConfig:
         Of the commands that came in time: the one with the newest sample stamp, or the last arrived.
     servo_timeout : int or None
         Samples without a new command after which the elevator goes to neutral; None for never.
+    aoa : bool
+        Whether it sends AOA_SSA; many vehicles do not.
     """
 
     model: Model
@@ -92,6 +94,7 @@ class PlantConfig:
     delta: SquareDelta | None = None
     latch: Literal["newest", "last"] = "newest"
     servo_timeout: int | None = DEFAULT_SERVO_TIMEOUT
+    aoa: bool = True
 
 
 @dataclass(frozen=True, slots=True)
@@ -314,7 +317,7 @@ class PlantNode:
             fields.setdefault(sensor.message, {})[sensor.field] = value * sensor.to_field
         attitude, air = fields[Attitude], fields.get(AoaSsa)
         self._send(Attitude(time_boot_ms=ms, **attitude))
-        if air is not None:
+        if air is not None and self.config.aoa:
             self._send(AoaSsa(t_ns // NS_PER_US, air.get("AOA", 0.0), air.get("SSA", 0.0)))
         condition = self.model.condition
         speed = condition.airspeed_m_s if condition is not None else 0.0

@@ -25,7 +25,9 @@ DPI = 150
 
 _BLACK, _ORANGE, _SKY, _GREEN = "#000000", "#E69F00", "#56B4E9", "#009E73"
 _BLUE, _VERMILLION, _PURPLE, _GREY = "#0072B2", "#D55E00", "#CC79A7", "#767676"
-_MODE_COLOURS = {"STANDBY": _GREY, "HOLD": _ORANGE, "NEUTRAL": _VERMILLION}
+_MODE_COLOURS = {
+    "STANDBY": _GREY, "LEVEL": _SKY, "CONSERVATIVE": _PURPLE, "HOLD": _ORANGE, "NEUTRAL": _VERMILLION
+}  # fmt: skip
 _OUTPUT_COLOURS = (_BLUE, _VERMILLION, _GREEN, _PURPLE)
 _LINK_COLOURS = {"up": _BLUE, "down": _ORANGE}
 _LINK_NAMES = {"up": "up, plant to autopilot", "down": "down, autopilot to plant"}
@@ -240,7 +242,7 @@ def _shade_modes(panels: list[Axes], flight: FlightData) -> None:
     for start_s, end_s, mode in flight.modes:
         if mode == _TRACKING or end_s <= start_s:
             continue
-        colour = _MODE_COLOURS.get(mode, _PURPLE)
+        colour = _MODE_COLOURS.get(mode, _BLACK)
         for n, panel in enumerate(panels):
             label = mode if n == 0 and mode not in named else None
             panel.axvspan(start_s, end_s, color=colour, alpha=0.22, linewidth=0, zorder=0, label=label)

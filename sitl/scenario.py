@@ -16,6 +16,7 @@ from typing import Literal, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from autopilot.alpha import AlphaChoice
 from autopilot.app import AutopilotConfig, AutopilotNode
 from autopilot.link.clock import Clock
 from autopilot.link.process import format_clock, parse_clock
@@ -136,8 +137,12 @@ class Scenario:
         Plant to autopilot, and back.
     clocks : mapping
         Node name to Clock.
-    actuator, failsafe, latch
+    actuator, failsafe, latch, alpha
         As the programs take them.
+    aoa : bool
+        Whether the plant sends AOA_SSA.
+    align : bool
+        Whether the autopilot looks its reference ahead by the forecast delay.
     servo_timeout : int or None
         Samples, None for never.
     x0 : (nx,) array or None
@@ -171,6 +176,9 @@ class Scenario:
     actuator: Literal["pwm", "float"] = "pwm"
     failsafe: Literal["on", "monitor"] = "on"
     latch: Literal["newest", "last"] = "newest"
+    alpha: AlphaChoice = "auto"
+    aoa: bool = True
+    align: bool = True
     servo_timeout: int | None = None
     x0: NDArray[np.float64] | None = None
     gust: HarmonicGust | None = None
@@ -187,7 +195,9 @@ class Scenario:
 
     def plant_node(self) -> PlantNode:
         """Return the plant, new."""
-        return PlantNode(PlantConfig(self.plant, self.x0, self.gust, self.delta, self.latch, self.servo_timeout))
+        return PlantNode(
+            PlantConfig(self.plant, self.x0, self.gust, self.delta, self.latch, self.servo_timeout, self.aoa)
+        )
 
     def relay_node(self) -> RelayNode:
         """Return the relay, new."""
@@ -197,7 +207,15 @@ class Scenario:
         """Return the autopilot, new."""
         profile = parse_profile(self.reference, self.gains.model.Ts)
         return AutopilotNode(
-            AutopilotConfig(self.gains, profile, self.actuator, self.failsafe, ground_stations=ground_stations)
+            AutopilotConfig(
+                self.gains,
+                profile,
+                self.actuator,
+                self.failsafe,
+                self.alpha,
+                self.align,
+                ground_stations=ground_stations,
+            )
         )
 
 
@@ -261,6 +279,9 @@ def _parse(table: Table, name: str, gains_name: str | None, plant_name: str | No
         actuator=_choice(table, "actuator", ("pwm", "float"), "pwm"),
         failsafe=_choice(table, "failsafe", ("on", "monitor"), "on"),
         latch=latch,
+        alpha=_choice(table, "alpha", ("auto", "aoa_ssa", "vfr_hud"), "auto"),
+        aoa=table.boolean("aoa", default=True),
+        align=table.boolean("align", default=True),
         servo_timeout=_servo_timeout(table, longest + SERVO_TIMEOUT_MARGIN),
         x0=table.vector("x0", length=plant.nx, default=None),
         gust=_gust(table, plant),
@@ -357,6 +378,7 @@ def plant_arguments(scenario: Scenario) -> list[str]:
     """Return the options with which ``sitl plant`` builds the scenario's plant."""
     arguments = ["--plant", scenario.plant_name, "--latch", scenario.latch]
     arguments += ["--servo-timeout", str(scenario.servo_timeout or 0)]
+    arguments += [] if scenario.aoa else ["--no-aoa"]
     arguments += ["--clock", format_clock(scenario.clocks["plant"])]
     if scenario.x0 is not None:
         arguments += ["--x0", ",".join(repr(value) for value in scenario.x0.tolist())]
@@ -378,5 +400,7 @@ def relay_arguments(scenario: Scenario) -> list[str]:
 def autopilot_arguments(scenario: Scenario) -> list[str]:
     """Return the options with which ``autopilot`` builds the scenario's autopilot."""
     arguments = ["--gains", scenario.gains_name, "--actuator", scenario.actuator]
-    arguments += ["--failsafe", scenario.failsafe, "--clock", format_clock(scenario.clocks["autopilot"])]
+    arguments += ["--failsafe", scenario.failsafe, "--alpha", scenario.alpha]
+    arguments += [] if scenario.align else ["--no-align"]
+    arguments += ["--clock", format_clock(scenario.clocks["autopilot"])]
     return [*arguments, "--reference", scenario.reference] if scenario.reference else arguments

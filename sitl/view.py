@@ -29,7 +29,14 @@ from sitl.scenario import Scenario
 
 __all__ = ["MODE_STYLES", "FlightView"]
 
-MODE_STYLES: Mapping[str, str] = {"STANDBY": "bright_black", "TRACKING": "green", "HOLD": "yellow", "NEUTRAL": "red"}
+MODE_STYLES: Mapping[str, str] = {
+    "STANDBY": "bright_black",
+    "TRACKING": "green",
+    "LEVEL": "cyan",
+    "CONSERVATIVE": "magenta",
+    "HOLD": "yellow",
+    "NEUTRAL": "red",
+}
 """Colour of each mode of the failsafe."""
 
 PLOT_S = 10.0

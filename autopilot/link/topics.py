@@ -90,9 +90,36 @@ SCHEMAS: Mapping[str, Mapping[str, Any]] = MappingProxyType(
             d=_field("integer", "Forecast delay of this command, samples; null if unknown.", nullable=True),
             d_low=_field("integer", "Least delay the forecast allows, samples; null if unknown.", nullable=True),
             d_high=_field("integer", "Greatest delay the forecast allows, samples; null if unknown.", nullable=True),
+            d_probability=_field("number", "Probability of [d_low, d_high], 0 to 1; null if unknown.", nullable=True),
             status=_field("string", "Status of the delay estimate."),
             mode=_field("string", "Mode of the failsafe."),
-            gain_set=_field("integer", "Index of the schedule's set of gains in force; 0 with plain gains."),
+            gain_set=_field(
+                "integer",
+                "Index of the schedule's set of gains in force, 0 with plain gains; their number for the conservative.",
+            ),
+            alpha=_field("string", "Source of the angle of attack: aoa_ssa; vfr_hud, the noisy one; or none."),
+        ),
+        "autopilot/estimate": _schema(
+            "Autopilot estimates",
+            "Once a second: what the autopilot knows of the two clocks and of the loop's delay.",
+            offset_ns=_field("integer", "Plant's clock minus own clock, ns; null if unknown.", nullable=True),
+            offset_bound_ns=_field("integer", "Largest error of the offset, ns; null if unknown.", nullable=True),
+            skew_ppb=_field("number", "How much faster the plant's clock runs, ppb; null if unknown.", nullable=True),
+            skew_bound_ppb=_field("number", "Largest error of the skew, ppb; null if unknown.", nullable=True),
+            clock=_field("string", "Status of the clock estimate."),
+            round_trip_ns=_field(
+                "integer", "Median TIMESYNC round trip, this second, ns; null if none.", nullable=True
+            ),
+            d_mean=_field("number", "Mean d that the plant reported this second; null if none.", nullable=True),
+            d_max=_field("integer", "Largest d that the plant reported this second; null if none.", nullable=True),
+            exact=_field("number", "Share of the latest forecasts that were right; null if none.", nullable=True),
+            covered=_field("number", "Share of them whose interval held d; null if none.", nullable=True),
+            changes=_field("integer", "How often the link was found to have changed."),
+            shift_ns=_field(
+                "integer", "By how much longer commands travel than TIMESYNC, ns, as the forecast takes it."
+            ),
+            unmatched=_field("integer", "TIMESYNC answers to no request of ours."),
+            steps=_field("integer", "How often a clock was found to have stepped."),
         ),
         "link/up": _link_schema("Link up", "from the plant to the autopilot"),
         "link/down": _link_schema("Link down", "from the autopilot to the plant"),

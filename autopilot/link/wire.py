@@ -31,6 +31,7 @@ __all__ = [
     "Heartbeat",
     "HilActuatorControls",
     "Message",
+    "NamedValueFloat",
     "NamedValueInt",
     "Reject",
     "ServoOutputRaw",
@@ -146,6 +147,15 @@ class HilActuatorControls:
 
 
 @dataclass(frozen=True, slots=True)
+class NamedValueFloat:
+    """NAMED_VALUE_FLOAT: milliseconds (u32, wraps), a name of at most 10 characters, a finite 32-bit float."""
+
+    time_boot_ms: int
+    name: str
+    value: float
+
+
+@dataclass(frozen=True, slots=True)
 class NamedValueInt:
     """NAMED_VALUE_INT: milliseconds (u32, wraps), a name of at most 10 characters, a signed 32-bit value."""
 
@@ -177,6 +187,7 @@ Message = (
     | VfrHud
     | ServoOutputRaw
     | HilActuatorControls
+    | NamedValueFloat
     | NamedValueInt
     | Timesync
     | StatusText
@@ -249,6 +260,12 @@ _CODECS: dict[type, _Codec] = {
         lambda m: (m.time_usec, 0, 0.0, m.elevator, *_NO_CONTROLS[2:], 0),
         lambda v: HilActuatorControls(v[0], v[2 + ELEVATOR_CHANNEL]),
         ("elevator",),
+    ),
+    NamedValueFloat: _Codec(
+        dialect.MAVLink_named_value_float_message,
+        lambda m: (m.time_boot_ms & U32, m.value, m.name.encode("ascii")),
+        lambda v: NamedValueFloat(v[0], _text(v[2]), v[1]),
+        ("value",),
     ),
     NamedValueInt: _Codec(
         dialect.MAVLink_named_value_int_message,

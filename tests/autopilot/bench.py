@@ -12,6 +12,8 @@ from autopilot.link.wire import PLANT, AoaSsa, Attitude, Message, NamedValueInt,
 from tests.helpers import HIRM, MS, TS, S, parse
 
 X0 = np.array([0.02, 0.0, 0.05])
+TREMBLE = 1e-7
+"""What a sample differs from its neighbours, rad and rad/s: just so much that floats of 32 bits show it."""
 
 
 @dataclass
@@ -39,7 +41,8 @@ class Bench:
                 if self.answers and (port, m.get_type()) == ("plant", "TIMESYNC") and m.tc1 == 0:
                     self.node.receive("plant", self.wire.encode(Timesync(self.now_ns, m.ts1)), self.now_ns)
         for record in self.node.records():
-            (self.events if record.topic == "events" else self.commands).append(record.body)
+            if record.topic in ("events", "autopilot/command"):
+                (self.events if record.topic == "events" else self.commands).append(record.body)
 
     def to(self, now_ns: int) -> None:
         """Tick at every deadline up to ``now_ns``."""
@@ -57,7 +60,8 @@ class Bench:
         self.to(self.now_ns)
 
     def sample(self, k: int, age_ns: int = 0, x: np.ndarray = X0) -> None:
-        """Let sample k arrive ``age_ns`` after it was taken."""
+        """Let sample k arrive ``age_ns`` after it was taken; it trembles, as a sensor that stands still is broken."""
+        x = x + (k % 2) * TREMBLE
         t_ns = self.t0_ns + k * TS
         self.to(t_ns + age_ns)
         self.give(

@@ -81,9 +81,11 @@ def sample_records(k: int) -> list[Record]:
         "d": 2 if known else None,
         "d_low": 1 if known else None,
         "d_high": 3 if known else None,
+        "d_probability": 0.97 if known else None,
         "status": "ok" if known else "unknown",
         "mode": "TRACKING",
         "gain_set": 0,
+        "alpha": "aoa_ssa",
     }
     packet = {
         "sent_ns": t_ns,

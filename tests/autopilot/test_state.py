@@ -18,6 +18,7 @@ quick = settings(deadline=None)
 MODEL = HIRM.model
 T0 = 137 * S + TS
 U32_MS = (1 << 32) * MS
+U32_US = (1 << 32) * 1000
 
 
 def state(k: int) -> np.ndarray:
@@ -205,6 +206,74 @@ def test_milliseconds_wrap_after_49_days_in_mid_flight():
     samples = feed(assembler, [m for k in range(40) for m in halves(k, t0_ns)])
     assert [s.j for s in samples] == list(range(40))
     assert [s.t_ns for s in samples] == [t0_ns + k * TS + 137_000 for k in range(40)]
+
+
+@pytest.mark.parametrize("order", [(0, 1), (1, 0)])
+@pytest.mark.parametrize("up_for_ns", [U32_MS - 10 * TS, U32_MS, 5 * U32_MS + 3 * S])
+def test_without_the_plants_time_angle_of_attack_tells_how_often_milliseconds_have_wrapped(up_for_ns, order):
+    assembler = SampleAssembler(MODEL)
+    assembler.number(0, halves(0, up_for_ns)[0].time_boot_ms)
+    samples = feed(assembler, [halves(k, up_for_ns)[half] for k in range(40) for half in order])
+    assert [s.j for s in samples] == list(range(40))
+    assert [s.t_ns for s in samples] == [up_for_ns + k * TS + 137_000 for k in range(40)]
+    assert not assembler.drops
+
+
+def test_once_the_plants_time_is_known_stamps_of_attitude_alone_go_on_from_it():
+    assembler = SampleAssembler(load_model("pendulum"))
+    t0_ns, step_ns = 2 * U32_MS - 300 * MS, 30 * MS
+    stamps = [t0_ns + k * step_ns for k in range(30)]
+    assembler.number(0, t0_ns // MS % (1 << 32))
+    samples = [
+        assembler.add(Attitude(t_ns // MS % (1 << 32), *(6 * [0.0])), 0, t_ns if k >= 20 else None)
+        for k, t_ns in enumerate(stamps)
+    ]
+    assert [s.j for s in samples] == list(range(30))
+    assert [s.t_ns for s in samples] == [t_ns - U32_MS * (k < 20) for k, t_ns in enumerate(stamps)]
+    assert assembler.command_of(stamps[-1] // MS % (1 << 32), 2) == 27
+    assert not assembler.drops
+
+
+def test_a_sample_that_waits_for_its_number_is_moved_to_the_plants_time_with_it():
+    assembler = SampleAssembler(load_model("pendulum"))
+    t_ns = U32_MS + 7 * S
+    assert assembler.add(Attitude(7000, *(6 * [0.0])), 0) is None
+    sample = assembler.number(5, 7000, t_ns)
+    assert (sample.j, sample.t_ns, assembler.newest_ns) == (5, t_ns, t_ns)
+
+
+@pytest.mark.parametrize("known", [True, False])
+@pytest.mark.parametrize("up_for_ns", [U32_US - 10 * TS, U32_US, 7 * U32_US + 3 * S, 3 * U32_MS - 10 * TS])
+def test_an_angle_of_attack_stamped_by_a_u32_counter_wraps_after_71_minutes(up_for_ns, known):
+    assembler = SampleAssembler(MODEL)
+    near_ns = up_for_ns if known else None
+    assembler.number(0, halves(0, up_for_ns)[0].time_boot_ms, near_ns)
+    samples = []
+    for k in range(40):
+        attitude, air = halves(k, up_for_ns)
+        for message in (attitude, replace(air, time_usec=air.time_usec % (1 << 32))):
+            samples.append(assembler.add(message, 0, near_ns and near_ns + (k + 1) * TS))
+    stamps = [s.t_ns for s in samples if s is not None]
+    assert [s.j for s in samples if s is not None] == list(range(40))
+    if known or up_for_ns < U32_MS:
+        assert stamps == [up_for_ns + k * TS + 137_000 for k in range(40)]
+    assert not assembler.drops
+
+
+def test_such_a_vehicle_is_found_again_after_a_blackout_across_the_wrap():
+    t0_ns = U32_US - 10 * TS
+    assembler = numbered(0, t0_ns)
+    stream = [m for k in (*range(5), *range(900, 910)) for m in halves(k, t0_ns)]
+    stream = [replace(m, time_usec=m.time_usec % (1 << 32)) if isinstance(m, AoaSsa) else m for m in stream]
+    assert [s.j for s in feed(assembler, stream)] == [*range(5), *range(900, 910)]
+
+
+@pytest.mark.parametrize("back_ms", [1, 900, 10_000])
+def test_no_stamp_is_before_the_plants_clock_began(back_ms):
+    for message in (Attitude((1 << 32) - back_ms, *(6 * [0.0])), AoaSsa((1 << 32) - 1000 * back_ms, 0.0, 0.0)):
+        assembler = SampleAssembler(MODEL)
+        assert assembler.add(message, 0, 500 * MS) is None
+        assert assembler.drops == {Drop.FROM_THE_FUTURE: 1}
 
 
 def test_a_stamp_from_the_future_is_refused_and_the_present_goes_on():

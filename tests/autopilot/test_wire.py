@@ -20,6 +20,7 @@ from autopilot.link.wire import (
     Attitude,
     Heartbeat,
     HilActuatorControls,
+    NamedValueFloat,
     NamedValueInt,
     Reject,
     ServoOutputRaw,
@@ -48,6 +49,7 @@ messages = st.one_of(
     st.builds(VfrHud, f32, f32, i16, u16, f32, f32),
     st.builds(ServoOutputRaw, u32, u16),
     st.builds(HilActuatorControls, u64, f32),
+    st.builds(NamedValueFloat, u32, names, f32),
     st.builds(NamedValueInt, u32, names, i32),
     st.builds(Timesync, i64, i64),
     st.builds(StatusText, u8, ascii_text),
@@ -64,6 +66,7 @@ EXAMPLES = [
     NamedValueInt(77, "DELAY_K", 3),
     Timesync(0, 1_042_000_000_000),
     StatusText(6, "hello"),
+    NamedValueFloat(78, "D_MEAN", 2.25),
 ]
 
 
@@ -126,6 +129,7 @@ def test_frames_packed_by_pymavlink_are_read_by_field():
         dialect.MAVLink_vfr_hud_message(100.5, 99.5, -1, 42, 1600.0, 2.5),
         dialect.MAVLink_servo_output_raw_message(0xFFFFFFFF, 1, 1100, 1200, 1300, 1400, 1500, 1600, 1700, 1800),
         dialect.MAVLink_hil_actuator_controls_message(9, [n / 16 for n in range(16)], 129, 0),
+        dialect.MAVLink_named_value_float_message(6, b"TEN_LETTER", -0.375),
         dialect.MAVLink_named_value_int_message(5, b"SAMPLE_K", -7),
         dialect.MAVLink_timesync_message(-3, 1 << 60),
         dialect.MAVLink_statustext_message(4, b"fifty".ljust(50, b"!")),
@@ -138,6 +142,7 @@ def test_frames_packed_by_pymavlink_are_read_by_field():
         VfrHud(100.5, 99.5, -1, 42, 1600.0, 2.5),
         ServoOutputRaw(0xFFFFFFFF, 1200),
         HilActuatorControls(9, 1 / 16),
+        NamedValueFloat(6, "TEN_LETTER", -0.375),
         NamedValueInt(5, "SAMPLE_K", -7),
         Timesync(-3, 1 << 60),
         StatusText(4, "fifty".ljust(50, "!")),
@@ -157,6 +162,7 @@ def test_times_wrap_on_the_wire_as_u32():
         (EXAMPLES[1], "time_boot_ms"),
         (EXAMPLES[4], "time_usec"),
         (EXAMPLES[6], "time_boot_ms"),
+        (EXAMPLES[-1], "time_boot_ms"),
     ):
         [back] = autopilot.decode(plant.encode(replace(message, **{name: (1 << 32) + 9})))
         assert getattr(back, name) == 9

@@ -61,8 +61,50 @@ def test_show_json_of_gains_is_the_gains() -> None:
     assert shown == {
         "kind": "gains", "name": "hirm-paper", "model": "hirm", "Ts": 0.025, "d_min": 1, "d_max": 4,
         "K1": gains.K1.tolist(), "K2": gains.K2.tolist() if gains.K2 is not None else None,
-        "certificate": "none",
+        "certificate": "none", "conservative": None,
     }  # fmt: skip
+
+
+def test_conservative_gains_are_shown_with_their_own_certificate() -> None:
+    text = invoke("show", "hirm-d3")
+    line = "conservative: hirm-d6, delay 1 to 6 samples (25 to 150 ms), certificate verified: eta 0.2079"
+    assert [shown.startswith(line) for shown in text.splitlines()].count(True) == 1
+    assert "conservative" not in invoke("show", "hirm-d6")
+    shown, wide = (json.loads(invoke("show", name, "--json")) for name in ("hirm-d3", "hirm-d6"))
+    keys = ("name", "d_min", "d_max", "K1", "K2", "certificate")
+    assert shown["conservative"] == {key: wide[key] for key in keys}
+
+
+def conservative_pair(folder: Path) -> Path:
+    """The published gains for delays 1 to 2, their conservative ones for 1 to 4 in the file beside them."""
+    folder.mkdir()
+    paper = load_gains("hirm-paper")
+    save_gains(folder / "wide.toml", paper, "hirm")
+    narrow = replace(paper, d_max=2, conservative=paper, conservative_file=folder / "wide.toml")
+    save_gains(folder / "g.toml", narrow, "hirm")
+    return folder / "g.toml"
+
+
+def test_certified_gains_keep_their_conservative_ones(tmp_path: Path) -> None:
+    file, path = conservative_pair(tmp_path / "from"), tmp_path / "proved.toml"
+    for delay in ("1:3", "2:2"):
+        result = process("certify", str(file), "--delay", delay, "--method", "lyapunov", "-o", str(path))
+        assert result.returncode == 0
+        assert 'conservative = "from/wide.toml"\n' in path.read_text()
+        gains = load_gains(path)
+        assert gains.conservative is not None
+        assert (gains.conservative.d_max, verified(gains).passed) == (4, True)
+
+
+def test_a_window_that_conservative_gains_do_not_hold_is_not_written(tmp_path: Path) -> None:
+    file, path = conservative_pair(tmp_path / "from"), tmp_path / "proved.toml"
+    result = process("certify", str(file), "--delay", "0:2", "--method", "lyapunov", "-o", str(path))
+    assert result.returncode == 2
+    asked = "gains for delays from 0 or less to 3 or more"
+    assert result.stderr.endswith(
+        f"gains: error: {path}: conservative: expected {asked}, found hirm-paper, for 1 to 4\n"
+    )
+    assert not path.exists()
 
 
 def test_show_prints_matrices_with_the_names_of_the_states() -> None:
@@ -231,7 +273,7 @@ def test_show_json_of_a_schedule_is_the_schedule(schedule: Path) -> None:
             {"d_min": 1, "d_max": 2, "K1": gains.K1.tolist(), "K2": K2},
             {"d_min": 2, "d_max": 4, "K1": (gains.K1 + 0.25).tolist(), "K2": K2},
         ],
-        "certificate": "none",
+        "certificate": "none", "conservative": None,
     }  # fmt: skip
 
 

@@ -4,15 +4,17 @@ import contextlib
 import copy
 import tomllib
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import tomli_w
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gains.certificate import claim_hash, gains_hash, model_hash
+from gains.certificate import claim_hash, gains_hash, law_hash, model_hash
 from gains.model import Gains, Model, Schedule, sets_of
 from gains.steady import equilibrium
 from gains.store import (
@@ -218,8 +220,22 @@ GAINS_COMPLAINTS = [
     ("K2", [[1.0]], "K2: expected 3 columns, found 1"),
     ("K2", GONE, "K2: expected a matrix (an array of rows), found nothing"),
     ("certificate", 1, "certificate: expected a table, found 1"),
-    ("certficate", {}, "certficate: expected one of name, model, d_min, d_max, K1, K2, certificate, "
+    ("certficate", {}, "certficate: expected one of name, model, d_min, d_max, K1, K2, certificate, conservative, "
                        "found an unknown key; did you mean certificate?"),
+    ("conservativ", "hirm-d6", "conservativ: expected one of name, model, d_min, d_max, K1, K2, certificate, "
+                               "conservative, found an unknown key; did you mean conservative?"),
+    ("conservative", 6, "conservative: expected a string, found 6"),
+    ("conservative", "", 'conservative: expected a string, found the string ""'),
+    ("conservative", {}, "conservative: expected a string, found a table"),
+    ("conservative", "hirm-d7", "conservative: hirm-d7: expected a stored name or a file, found neither; "
+                                "did you mean hirm-d6?"),
+    ("conservative", "hirm", "conservative: expected one set of gains (d_min, d_max, K1), found hirm, a model"),
+    ("conservative", "hirm-d3", "conservative: expected gains without conservative ones of their own, "
+                                "found hirm-d3, which has some"),
+    ("conservative", "pendulum-paper", "conservative: expected gains for the same model (hirm: Ts, states, trim and "
+                                       "matrices), found pendulum-paper, for another (pendulum)"),
+    ("conservative", "hirm-paper", "conservative: expected gains for delays from 1 or less to 5 or more, "
+                                   "found hirm-paper, for 1 to 4"),
     ("window", [{}], "window: expected one set of gains (d_min, d_max, K1), found a schedule"),
 ]  # fmt: skip
 
@@ -287,8 +303,12 @@ SCHEDULE_COMPLAINTS = [
     (SCHEDULE | {"window": []}, "window: expected at least one window, found none"),
     (SCHEDULE | {"window": 3}, "window: expected an array of tables, found 3"),
     (SCHEDULE | {"window": [1]}, "window[0]: expected a table, found 1"),
-    (SCHEDULE | {"K1": [[1.0, 2.0, 3.0]]}, "K1: expected one of name, model, window, certificate, "
+    (SCHEDULE | {"K1": [[1.0, 2.0, 3.0]]}, "K1: expected one of name, model, window, certificate, conservative, "
                                            "found an unknown key"),
+    (windows(0, "conservative", "hirm-d6"), "window[0].conservative: expected one of d_min, d_max, K1, K2, "
+                                            "found an unknown key"),
+    (SCHEDULE | {"conservative": "hirm-d6"}, "conservative: expected gains for delays from 1 or less to 7 or more, "
+                                             "found hirm-d6, for 1 to 6"),
     (SCHEDULE | {"certificate": 1}, "certificate: expected a table, found 1"),
     (changed(SCHEDULE, "name", GONE), "name: expected a string, found nothing"),
 ]  # fmt: skip
@@ -319,6 +339,176 @@ def test_a_schedule_survives_its_file_bit_by_bit(tmp_path: Path) -> None:
         np.testing.assert_array_equal(np.array(read.K2), np.array(written.K2))
     with pytest.raises(InputError, match=r"s\.toml: window: expected one set of gains .*, found a schedule$"):
         load_gains(tmp_path / "s.toml")
+
+
+def gain_file(path: Path, **fields: object) -> Path:
+    """Write gains for hirm, window 1 to 4, with fields set otherwise."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(tomli_w.dumps(GAINS | fields))
+    return path
+
+
+def model_file(path: Path, field: str, value: object) -> Path:
+    """Write the model hirm under another name, with one field set otherwise."""
+    data = tomllib.loads(resolve("hirm").read_text())
+    path.write_text(tomli_w.dumps(changed(data, field, value) | {"name": "other"}))
+    return path
+
+
+def refusal(path: Path) -> str:
+    """What is said of a file after its name."""
+    with pytest.raises(InputError) as caught:
+        load_law(path)
+    return str(caught.value).removeprefix(f"{path}: ")
+
+
+@pytest.mark.parametrize("data", [GAINS, windows(2, "d_max", 5)], ids=["gains", "schedule"])
+def test_a_law_comes_with_the_conservative_gains_that_its_file_names(data: dict[str, Any]) -> None:
+    law = parse_law(Table(data | {"conservative": "hirm-d6"}, "f.toml"))
+    conservative = law.conservative
+    assert isinstance(conservative, Gains)
+    assert (conservative.name, conservative.d_min, conservative.d_max) == ("hirm-d6", 1, 6)
+    assert conservative.model is law.model
+    assert conservative.conservative is None
+    assert law.conservative_file == resolve("hirm-d6")
+    assert parse_law(Table(data, "f.toml")).conservative is None
+
+
+def test_stored_designs_fall_back_on_the_one_of_the_widest_window() -> None:
+    for name in ("hirm-d3", "hirm-d4"):
+        conservative = load_law(name).conservative
+        assert conservative is not None
+        assert conservative.name == "hirm-d6"
+        assert verified(conservative).passed
+    assert load_law("hirm-d6").conservative is None
+
+
+def test_conservative_gains_are_no_part_of_what_a_certificate_is_for() -> None:
+    law = load_gains("hirm-d3")
+    assert verified(law).passed
+    assert verified(replace(law, conservative=None)).passed
+    assert law_hash(law) == law_hash(replace(law, conservative=None))
+
+
+def test_just_a_wider_window_around_the_first_is_conservative(tmp_path: Path) -> None:
+    narrow = gain_file(tmp_path / "narrow.toml", d_min=1, d_max=3, conservative="wide.toml")
+    for d_min in range(6):
+        for d_max in range(d_min, 6):
+            gain_file(tmp_path / "wide.toml", name="w", d_min=d_min, d_max=d_max)
+            if d_min <= 1 and d_max > 3:
+                assert load_gains(narrow).conservative is not None
+            else:
+                asked = "gains for delays from 1 or less to 4 or more"
+                assert refusal(narrow) == f"conservative: expected {asked}, found w, for {d_min} to {d_max}"
+
+
+def test_conservative_gains_are_one_set(tmp_path: Path) -> None:
+    (tmp_path / "s.toml").write_text(tomli_w.dumps(SCHEDULE))
+    file = gain_file(tmp_path / "g.toml", conservative="s.toml")
+    asked = "one set of gains (d_min, d_max, K1)"
+    assert refusal(file) == f"conservative: expected {asked}, found s.toml, a schedule"
+
+
+@pytest.mark.parametrize("name", ["g.toml", "./g.toml", "../here/g.toml", "link.toml"])
+def test_gains_are_not_their_own_conservative_ones(name: str, tmp_path: Path) -> None:
+    file = gain_file(tmp_path / "here" / "g.toml", conservative=name)
+    (tmp_path / "here" / "link.toml").symlink_to(file)
+    assert refusal(file) == "conservative: expected another file, found this one"
+
+
+def test_conservative_gains_make_no_chain_and_no_circle(tmp_path: Path) -> None:
+    one = gain_file(tmp_path / "one.toml", d_max=2, conservative="two.toml")
+    two = gain_file(tmp_path / "two.toml", d_max=3, conservative="one.toml")
+    asked = "gains without conservative ones of their own"
+    assert refusal(one) == f"conservative: expected {asked}, found two.toml, which has some"
+    assert refusal(two) == f"conservative: expected {asked}, found one.toml, which has some"
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("Ts", 0.03),
+        ("plant.states", ["q_rad_s", "alpha_rad", "theta_rad"]),
+        ("plant.B", [[-0.113], [-3.259], [0.001]]),
+        ("trim", {"x": [0.01, 0.0, 0.0]}),
+        ("trim", {"u": [0.01]}),
+        ("uncertainty.J2", [[0.5]]),
+    ],
+)
+def test_conservative_gains_for_another_model_are_refused(field: str, value: object, tmp_path: Path) -> None:
+    model_file(tmp_path / "other.toml", field, value)
+    gain_file(tmp_path / "wide.toml", name="w", model="other.toml", d_max=6)
+    file = gain_file(tmp_path / "g.toml", conservative="wide.toml")
+    asked = "gains for the same model (hirm: Ts, states, trim and matrices)"
+    assert refusal(file) == f"conservative: expected {asked}, found w, for another (other)"
+
+
+def test_a_model_of_another_name_and_the_same_content_is_the_same_model(tmp_path: Path) -> None:
+    model_file(tmp_path / "other.toml", "uncertainty.delta_max", 0.1)
+    gain_file(tmp_path / "wide.toml", model="other.toml", d_max=6)
+    law = load_gains(gain_file(tmp_path / "g.toml", conservative="wide.toml"))
+    assert law.conservative is not None
+    assert law.conservative.model is law.model
+
+
+@pytest.mark.parametrize(
+    ("fields", "complaint"),
+    [
+        ({"K1": [[1.0]]}, "K1: expected 3 columns, found 1"),
+        ({"d_mox": 6}, "d_mox: expected one of name, model, d_min, d_max, K1, K2, certificate, found an unknown key; "
+                       "did you mean d_max?"),
+        ({"certificate": {}}, "certificate.sha256: expected a table, found nothing"),
+        ({"model": "nowhere"}, "model: nowhere: expected a stored name or a file, found neither"),
+    ],
+)  # fmt: skip
+def test_a_fault_in_conservative_gains_names_their_file(fields: dict[str, Any], complaint: str, tmp_path: Path) -> None:
+    wide = gain_file(tmp_path / "wide.toml", **({"d_max": 6} | fields))
+    assert refusal(gain_file(tmp_path / "g.toml", conservative="wide.toml")) == f"{wide}: {complaint}"
+
+
+@pytest.mark.parametrize("data", [GAINS, windows(2, "d_max", 5)], ids=["gains", "schedule"])
+@pytest.mark.parametrize(
+    ("given", "written"), [("hirm-d6", "hirm-d6"), ("sub/wide.toml", "../a/sub/wide.toml"), ("../w.toml", "../w.toml")]
+)
+def test_a_saved_law_names_its_conservative_gains_from_its_own_place(
+    data: dict[str, Any], given: str, written: str, tmp_path: Path
+) -> None:
+    for name in ("a/sub/wide.toml", "w.toml"):
+        gain_file(tmp_path / name, d_max=6, K1=[[0.1 + 0.2, 2.0, 3.0]])
+    (tmp_path / "a" / "g.toml").write_text(tomli_w.dumps(data | {"conservative": given}))
+    law = load_law(tmp_path / "a" / "g.toml")
+    (tmp_path / "b").mkdir()
+    save_gains(tmp_path / "b" / "g.toml", law, "hirm")
+    assert tomllib.loads((tmp_path / "b" / "g.toml").read_text())["conservative"] == written
+    back = load_law(tmp_path / "b" / "g.toml").conservative
+    assert law.conservative is not None
+    assert back is not None
+    assert (back.name, back.d_min, back.d_max) == (law.conservative.name, 1, 6)
+    np.testing.assert_array_equal(back.K1, law.conservative.K1)
+
+
+def test_a_law_without_conservative_gains_is_saved_without_the_key(tmp_path: Path) -> None:
+    for law in (load_gains("hirm-paper"), replace(load_gains("hirm-d3"), conservative=None)):
+        save_gains(tmp_path / "g.toml", law, "hirm")
+        assert "conservative" not in tomllib.loads((tmp_path / "g.toml").read_text())
+
+
+def test_a_law_that_outgrows_its_conservative_gains_is_not_saved(tmp_path: Path) -> None:
+    path, law = tmp_path / "g.toml", load_gains("hirm-d3")
+    save_gains(path, replace(law, d_max=5, certificate=None), "hirm")
+    before = path.read_bytes()
+    for window in ({"d_max": 6}, {"d_min": 0}):
+        with pytest.raises(InputError, match=r"g\.toml: conservative: expected gains .*, found hirm-d6, for 1 to 6$"):
+            save_gains(path, replace(law, **window), "hirm")
+    assert path.read_bytes() == before
+
+
+def test_a_law_does_not_replace_its_conservative_gains(tmp_path: Path) -> None:
+    wide = gain_file(tmp_path / "wide.toml", d_max=6)
+    law, before = load_gains(gain_file(tmp_path / "g.toml", conservative="wide.toml")), wide.read_bytes()
+    with pytest.raises(InputError, match=r"wide\.toml: conservative: expected another file, found this one$"):
+        save_gains(wide, law, "hirm")
+    assert wide.read_bytes() == before
 
 
 def test_a_law_of_one_set_is_its_gains() -> None:
@@ -488,7 +678,7 @@ def test_windows_are_taken_just_when_they_rise_without_a_hole(bounds: list[tuple
         assert [(g.d_min, g.d_max) for g in sets_of(parse_law(Table(data, "f.toml")))] == bounds
 
 
-@given(st.sampled_from([*GAINS, "certificate", "window"]), VALUES | MATRICES)
+@given(st.sampled_from([*GAINS, "certificate", "window", "conservative"]), VALUES | MATRICES)
 def test_any_value_in_any_field_of_gains_is_taken_or_refused(field: str, value: object) -> None:
     with contextlib.suppress(InputError):
         assert parse_gains(Table(GAINS | {field: value}, "f.toml")).K1.shape == (1, 3)

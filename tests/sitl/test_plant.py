@@ -469,6 +469,16 @@ def test_the_number_is_sent_with_every_sample_until_a_command_and_then_every_sec
     assert numbers == [((T0 + k * TS) // MS, k) for k in [*range(5), 40, 80, 120, 160, 200]]
 
 
+def test_a_plant_without_aoa_ssa_sends_all_else_as_with_it():
+    x0 = np.array([0.02, -0.1, 0.05])
+    told, untold = bench(x0=x0), bench(x0=x0, aoa=False)
+    for b in (told, untold):
+        b.samples(0, 40)
+    assert len(told.of("AOA_SSA")) == 41
+    assert [m.to_dict() for m in untold.messages] == [m.to_dict() for m in told.messages if m.get_type() != "AOA_SSA"]
+    assert untold.truth == told.truth
+
+
 def test_the_pendulum_sends_no_angle_of_attack():
     b = bench(model=load_model("pendulum"), x0=np.array([0.1, 0.0]))
     b.tick(T0 + 10 * S)

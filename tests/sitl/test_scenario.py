@@ -46,6 +46,15 @@ def test_actuator_failsafe_and_latch_go_to_the_programs(tmp_path: Path) -> None:
     assert (plain.actuator, plain.failsafe, plain.latch) == ("pwm", "on", "newest")
 
 
+def test_a_plant_without_aoa_ssa_is_one_in_either_driver(tmp_path: Path) -> None:
+    scenario = load(tmp_path, top='aoa = false\nalpha = "vfr_hud"')
+    assert (scenario.aoa, scenario.plant_node().config.aoa, scenario.alpha) == (False, False, "vfr_hud")
+    assert "--no-aoa" in plant_arguments(scenario)
+    plain = load(tmp_path)
+    assert (plain.aoa, plain.plant_node().config.aoa, plain.alpha) == (True, True, "auto")
+    assert "--no-aoa" not in plant_arguments(plain)
+
+
 def test_a_variant_changes_what_its_table_says_and_nothing_else(tmp_path: Path) -> None:
     rest = '[variant.watched]\nfailsafe = "on"\n[variant.loose]\nservo_timeout = 0\n[variant.same]\n'
     scenario = load(tmp_path, top='failsafe = "monitor"\nservo_timeout = 20', rest=rest)
@@ -66,6 +75,8 @@ def test_the_servo_time_out_outlasts_the_longest_delay_of_the_witness(tmp_path: 
         (Witness("", "", 0.025, 0, 3, "fifo", 1.01, (1,)), "", "", "d_min: expected at least 1"),
         (FIFO, 'latch = "oldest"', "", "latch: expected one of newest, last"),
         (FIFO, 'actuator = "analog"', "", "actuator: expected one of pwm, float"),
+        (FIFO, 'alpha = "vane"', "", "alpha: expected one of auto, aoa_ssa, vfr_hud"),
+        (FIFO, 'aoa = "no"', "", "aoa: expected true or false"),
         (FIFO, 'failsafe = "off"', "", "failsafe: expected one of on, monitor"),
         (FIFO, "", '[variant.v]\nfailsafe = "off"', "variant.v.failsafe: expected one of on, monitor"),
         (FIFO, "", '[[check]]\nname = "n"\nmetric = "witness.missmatches"\nat_most = 0', "such as witness.mismatches"),

@@ -1,0 +1,354 @@
+"""What failsafe watches besides delay and age: samples that cannot be, an elevator at its limit, and silence.
+
+Each monitor is a small object with its own state. It is told what happens and when, and answers with an event for
+failsafe, or with what is wrong in words. None of them reads a clock. :class:`Plausibility` runs on every sample, so
+it works on plain floats.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from operator import mul
+
+from autopilot.failsafe import Event
+from autopilot.link.clock import NS_PER_S
+from autopilot.link.sensors import Measurement, sensors_of
+from autopilot.link.wire import AoaSsa, Attitude
+from gains.model import Model
+
+__all__ = [
+    "COMMAND_MEMORY",
+    "FROZEN_CHANGE",
+    "FROZEN_SAMPLES",
+    "JUMP_RAD",
+    "JUMP_SAMPLES",
+    "MAX_RATE_RAD_S",
+    "SATURATION_NS",
+    "Halves",
+    "Plausibility",
+    "Saturation",
+    "Silence",
+    "Verdict",
+]
+
+MAX_RATE_RAD_S = 10.0
+"""No aircraft here turns faster: 573 deg/s."""
+JUMP_RAD = 0.05
+"""What an angle may jump beside that, rad: noise and rounding, 2.9 deg."""
+JUMP_SAMPLES = 20
+"""After a gap of more samples than this an angle may be anywhere."""
+FROZEN_SAMPLES = 10
+"""After so many samples that only repeat a value it is asked whether the value must have moved."""
+FROZEN_CHANGE = math.radians(0.5)
+"""A value must have moved when the model says at least this over FROZEN_SAMPLES, rad or rad/s."""
+COMMAND_MEMORY = 20
+"""The input in force may be any of so many commands before the row: the loop delay is not known here."""
+CALM_SHARE = 0.01
+"""A disturbance does not reach a state directly that it moves by less than this share of the state it moves most."""
+SATURATION_NS = NS_PER_S
+"""How long the elevator may stay at its limit, ns."""
+
+_QUARTER, _HALF, _TURN = math.pi / 2.0, math.pi, 2.0 * math.pi
+_ROUNDING = 1e-6
+"""Floats of 32 bits and conversions from degrees may pass a limit by less than this, rad."""
+_ANGLES: Mapping[str, float] = {"pitch": _QUARTER, "roll": _HALF, "yaw": _HALF, "AOA": _QUARTER, "SSA": _QUARTER}
+"""Largest angle in each field, rad; all other fields are rates."""
+_NAMES: Mapping[type[Measurement], str] = {Attitude: "ATTITUDE", AoaSsa: "AOA_SSA"}
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """What is wrong with a sample.
+
+    Attributes
+    ----------
+    event : Event
+        IMPLAUSIBLE or FROZEN.
+    reason : str
+        The state, its value and the limit, on one short line.
+    """
+
+    event: Event
+    reason: str
+
+
+class Plausibility:
+    """Tells samples that no aircraft can have sent, and values that stand still although they must move.
+
+    *Implausible* is a value beyond the range of its field, or an angle that has moved since the last plausible
+    sample i by more than MAX_RATE_RAD_S (j - i) Ts + JUMP_RAD. A single wrong sample thus costs itself only, and a
+    lasting jump, of a sensor that has been set anew, is believed as soon as an aircraft could have turned so far.
+
+    *Frozen* is a single state that has repeated its value exactly for FROZEN_SAMPLES while the row does not fit the
+    model: the sum of ((A - I) x + B u) over the row, deviations from trim, misses the measured change by more than
+    FROZEN_CHANGE. What is looked at is the change of the state itself, and of those that it moves and no disturbance
+    does, as the pitch angle for a pitch rate; where the wind enters, the model explains too little. So a trimmed
+    aircraft in still air may stand still for ever. As the input in force is not known, any between the least and
+    the greatest of the last commands will do; before the first commands it is neutral. The sum never reaches
+    further back than the row, so that a small error of the model does not add up in a long steady flight.
+
+    A frozen state stays frozen until its value moves. Otherwise it would come back as good with the neutral
+    elevator that failsafe commands, since then nothing has to move any more.
+
+    A state that may as well be at rest is not told from a frozen one, so this finds a frozen sensor late in calm
+    flight: a pitch angle when the pitch rate moves, all states together when the elevator is commanded away from
+    where they would rest. A simulator without any noise, at rest in a steady wind of more than 2 deg/s that the
+    model does not know, would be called frozen.
+
+    Parameters
+    ----------
+    model : Model
+        With sensors and one input.
+    memory : int
+        COMMAND_MEMORY or more where the loop delay may be longer, samples.
+    """
+
+    def __init__(self, model: Model, memory: int = COMMAND_MEMORY) -> None:
+        assert model.nu == 1, model.nu
+        fields = [sensor.field for sensor in sensors_of(model)]
+        self._names = model.states
+        self._limits = [_ANGLES.get(field, MAX_RATE_RAD_S) + _ROUNDING for field in fields]
+        self._angles = [i for i, field in enumerate(fields) if field in _ANGLES]
+        self._jump_per_sample = MAX_RATE_RAD_S * model.Ts
+        self._trim: list[float] = model.trim.x.tolist()
+        self._neutral = float(model.trim.u[0])
+        self._A: list[list[float]] = model.A.tolist()
+        for i, row in enumerate(self._A):
+            row[i] -= 1.0
+        self._B: list[float] = model.B[:, 0].tolist()
+        self._moved = _moved(model)
+        self._u: deque[float] = deque(maxlen=memory + FROZEN_SAMPLES)
+        self._row: deque[tuple[int, Sequence[float]]] = deque(maxlen=FROZEN_SAMPLES)
+        self._same = [0] * model.nx
+        self._stuck: list[str | None] = [None] * model.nx
+        self._plausible: tuple[int, Sequence[float]] | None = None
+        self.forget()
+
+    def forget(self) -> None:
+        """Begin anew, as after a restart of the plant: nothing measured yet, the elevator neutral."""
+        self._u.extend([self._neutral] * (self._u.maxlen or 0))
+        self._row.clear()
+        self._same = [0] * len(self._same)
+        self._stuck = [None] * len(self._stuck)
+        self._plausible = None
+
+    def commanded(self, u: float) -> None:
+        """Take a command as it was sent, absolute, in units of u; every one of them, also neutral."""
+        self._u.append(u)
+
+    def judge(self, j: int, x: Sequence[float]) -> Verdict | None:
+        """Return what is wrong with sample j, or None. A number that does not rise begins anew.
+
+        Parameters
+        ----------
+        j : int
+            Number of the sample.
+        x : sequence of float, length nx
+            Its state, absolute, rad and rad/s.
+        """
+        if self._plausible is not None and j <= self._plausible[0]:
+            self.forget()
+        wrong = self._beyond(x) or self._jump(j, x)
+        if wrong is not None:
+            return Verdict(Event.IMPLAUSIBLE, wrong)
+        self._plausible = (j, x)
+        return self._frozen(j, x)
+
+    def _beyond(self, x: Sequence[float]) -> str | None:
+        """Say which value lies beyond its range; NaN lies beyond every one."""
+        for i, (value, limit) in enumerate(zip(x, self._limits, strict=True)):
+            if not -limit <= value <= limit:
+                return f"{self._names[i]} {value:.3g} beyond {limit:.3g}"
+        return None
+
+    def _jump(self, j: int, x: Sequence[float]) -> str | None:
+        """Say which angle has jumped since the last plausible sample; past a half turn is the short way round."""
+        if self._plausible is None:
+            return None
+        i, before = self._plausible
+        if j - i > JUMP_SAMPLES:
+            return None
+        most = self._jump_per_sample * (j - i) + JUMP_RAD
+        for n in self._angles:
+            change = math.remainder(x[n] - before[n], _TURN)
+            if not -most <= change <= most:
+                return f"{self._names[n]} jumped {change:.3g}, limit {most:.3g}"
+        return None
+
+    def _frozen(self, j: int, x: Sequence[float]) -> Verdict | None:
+        """Return the verdict on a state that stands still although it must move."""
+        if self._row:
+            for i, (value, before) in enumerate(zip(x, self._row[-1][1], strict=True)):
+                if value == before:
+                    self._same[i] += 1
+                else:
+                    self._same[i], self._stuck[i] = 0, None
+            if max(self._same) >= FROZEN_SAMPLES:
+                self._find_stuck(j, x)
+        self._row.append((j, x))
+        stuck = next(filter(None, self._stuck), None)
+        return None if stuck is None else Verdict(Event.FROZEN, stuck)
+
+    def _find_stuck(self, j: int, x: Sequence[float]) -> None:
+        """Note each state that has stood still over a row that does not fit the model."""
+        missed = self._missed(j, x)
+        for n, same in enumerate(self._same):
+            if same < FROZEN_SAMPLES or self._stuck[n] is not None:
+                continue
+            i = max(self._moved[n], key=missed.__getitem__)
+            if missed[i] > FROZEN_CHANGE:
+                off = f"{self._names[i]} off by {missed[i]:.2g} > {FROZEN_CHANGE:.2g}"
+                self._stuck[n] = f"{self._names[n]} frozen at {x[n]:.3g}, {off}"
+
+    def _missed(self, j: int, x: Sequence[float]) -> list[float]:
+        """Return by how much each state's change over the row misses the model's, at the least, per FROZEN_SAMPLES.
+
+        Over lost samples the one before stands for them.
+        """
+        numbers, states = zip(*self._row, strict=True)
+        spans = [after - before for before, after in pairwise((*numbers, j))]
+        steps = j - numbers[0]
+        columns = zip(*states, strict=True)
+        dx = [sum(map(mul, spans, values)) - steps * trim for values, trim in zip(columns, self._trim, strict=True)]
+        low, high = steps * (min(self._u) - self._neutral), steps * (max(self._u) - self._neutral)
+        missed = []
+        for A, B, before, now in zip(self._A, self._B, states[0], x, strict=True):
+            rest = sum(map(mul, A, dx)) - (now - before)
+            one, other = rest + B * low, rest + B * high
+            least = 0.0 if one * other <= 0.0 else min(abs(one), abs(other))
+            missed.append(least * FROZEN_SAMPLES / steps)
+        return missed
+
+
+def _moved(model: Model) -> list[list[int]]:
+    """Return for each state itself and the states that it moves while no disturbance reaches them directly."""
+    gust = abs(model.E).sum(axis=1)
+    calm = gust < CALM_SHARE * gust.max(initial=0.0)  # nowhere, where the model knows no disturbance
+    return [[i for i in range(model.nx) if i == n or (calm[i] and model.A[i, n] != 0.0)] for n in range(model.nx)]
+
+
+@dataclass(slots=True)
+class Saturation:
+    """Tells when the elevator has been at its limit without a break for too long.
+
+    Parameters
+    ----------
+    limit_ns : int
+        For how long it may be, ns; 0 switches the monitor off.
+    """
+
+    limit_ns: int = SATURATION_NS
+    _since_ns: int | None = None
+
+    def told(self, saturated: bool, now_ns: int) -> Event | None:
+        """Take one command as it was sent, held and neutral ones too; return SATURATED for each that is one too many.
+
+        Parameters
+        ----------
+        saturated : bool
+            Whether the command is one that the travel limited.
+        now_ns : int
+            Own time.
+        """
+        if not saturated:
+            self._since_ns = None
+            return None
+        if self._since_ns is None:
+            self._since_ns = now_ns
+        late = self.limit_ns > 0 and now_ns - self._since_ns >= self.limit_ns
+        return Event.SATURATED if late else None
+
+
+@dataclass(slots=True)
+class Silence:
+    """Tells when the ground station, once heard, has fallen silent, and when it is back; each of it once.
+
+    Parameters
+    ----------
+    timeout_ns : int
+        Silence for longer than this is a loss, ns; 0 switches the monitor off.
+
+    Attributes
+    ----------
+    lost : bool
+        Whether it is lost now; never before it was heard for the first time.
+    """
+
+    timeout_ns: int
+    lost: bool = False
+    _heard_ns: int | None = None
+
+    def heard(self, now_ns: int) -> Event | None:
+        """Take a sign of life; return GROUND_BACK when it was lost."""
+        self._heard_ns = now_ns
+        was_lost, self.lost = self.lost, False
+        return Event.GROUND_BACK if was_lost else None
+
+    def tick(self, now_ns: int) -> Event | None:
+        """Return GROUND_LOST when the silence has just become too long."""
+        due_ns = self.deadline_ns()
+        if due_ns is None or now_ns < due_ns:
+            return None
+        self.lost = True
+        return Event.GROUND_LOST
+
+    def deadline_ns(self) -> int | None:
+        """Return when ``tick`` is wanted; None while nothing can be lost."""
+        if self._heard_ns is None or self.lost or self.timeout_ns <= 0:
+            return None
+        return self._heard_ns + self.timeout_ns
+
+
+class Halves:
+    """Tells which half of the state has stopped coming while the other comes.
+
+    A half is missed from the first message of another half on that follows its own last one. When nothing at all
+    has come for the limit, the link was gone, not one half, and the time begins anew.
+
+    Parameters
+    ----------
+    needed : iterable of type
+        The messages that carry a state; with one there are no halves.
+    limit_ns : int
+        For how long a half may be missed, ns; some samples, as a packet may be lost or late.
+
+    Attributes
+    ----------
+    missing : set of type
+        What is missing now.
+    """
+
+    def __init__(self, needed: Iterable[type[Measurement]], limit_ns: int) -> None:
+        self.limit_ns = limit_ns
+        self.missing: set[type[Measurement]] = set()
+        self._missed_ns: dict[type[Measurement], int | None] = dict.fromkeys(needed)
+        self._last_ns: int | None = None
+
+    def forget(self) -> None:
+        """Begin anew, as after a restart of the plant."""
+        self.missing.clear()
+        self._missed_ns = dict.fromkeys(self._missed_ns)
+        self._last_ns = None
+
+    def came(self, message: type[Measurement], now_ns: int) -> str | None:
+        """Take the type of a measurement; return what has just begun to be missing, in words, or None."""
+        assert message in self._missed_ns, message
+        if self._last_ns is not None and now_ns - self._last_ns > self.limit_ns:
+            self._missed_ns = dict.fromkeys(self._missed_ns)
+        self._last_ns = now_ns
+        self.missing.discard(message)
+        self._missed_ns[message] = None
+        said = None
+        for other, missed_ns in self._missed_ns.items():
+            if other is message:
+                continue
+            if missed_ns is None:
+                self._missed_ns[other] = now_ns
+            elif now_ns - missed_ns > self.limit_ns and other not in self.missing:
+                self.missing.add(other)
+                said = f"{_NAMES[other]} missing"
+        return said

@@ -1,0 +1,343 @@
+"""Who flies, and what leaves: from a sample and the forecast of its command's delay to the command.
+
+Per sample: what the sample is worth to failsafe, which set of gains its forecast chooses, the reference at the
+expected instant of application, and the input of the law in force, or the one held, or neutral. Between samples:
+what follows from silence. The rules are elsewhere (``failsafe.py``, ``monitors.py``, ``control.py``,
+``reference.py``); this is their order.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from autopilot.config import AutopilotConfig
+from autopilot.control import ChosenSets, Law, SetChooser, law_of
+from autopilot.delay import DelayEstimate
+from autopilot.failsafe import FLOWN_BY_LAW, Event, FailsafeState, Limits, Mode, step
+from autopilot.link.wire import Severity
+from autopilot.monitors import COMMAND_MEMORY, Plausibility, Saturation, Silence
+from autopilot.reference import Profile, ReferenceModel, match_reference
+from autopilot.state import Sample
+from gains.model import GainLaw, Gains, sets_of
+
+__all__ = ["Command", "Notice", "Pilot"]
+
+MAX_AHEAD = 200
+"""Samples that the reference is looked ahead at the most, whatever delay a peer makes us believe in."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Command:
+    """A command as it is sent.
+
+    Attributes
+    ----------
+    at_ns : int
+        Own time.
+    sample : Sample
+        What it was computed from.
+    forecast : DelayEstimate
+        Of its delay.
+    xr : tuple of float
+        The reference state it carries; empty without a reference.
+    u : float
+        The input, absolute, within the travel.
+    saturated : bool
+        Whether the travel limited it.
+    mode : Mode
+        Who made it.
+    gain_set : int
+        Index of the schedule's set in force; the number of sets where the conservative gains fly.
+    """
+
+    at_ns: int
+    sample: Sample
+    forecast: DelayEstimate
+    xr: tuple[float, ...]
+    u: float
+    saturated: bool
+    mode: Mode
+    gain_set: int
+
+
+class Notice(NamedTuple):
+    """A change of mode, to be told to people and to the recording."""
+
+    at_ns: int
+    severity: int
+    text: str
+    data: Mapping[str, object]
+
+
+class Pilot:
+    """The law, its conservative stand-in, and failsafe over both.
+
+    Parameters
+    ----------
+    config : AutopilotConfig
+        What flies.
+    tell : callable
+        Takes a Notice of each change of mode.
+
+    Raises
+    ------
+    InputError
+        When the model cannot be flown over MAVLink (sensors, actuator).
+    """
+
+    def __init__(self, config: AutopilotConfig, tell: Callable[[Notice], None]) -> None:
+        gains = config.gains
+        self.config = config
+        self.model = gains.model
+        self.sets = sets_of(gains)
+        self.windows = [(each.d_min, each.d_max) for each in self.sets]
+        self.conservative: Gains | None = gains.conservative
+        self.failsafe = FailsafeState()
+        self.limits = Limits(config.hold_ns, conservative=self.conservative is not None)
+        self.ground = Silence(config.ground_timeout_ns)
+        self._tell = tell
+        self._laws = [law_of(each) for each in self.sets]
+        self._conservative_law = law_of(self.conservative) if self.conservative is not None else None
+        self.travel = self._laws[0].travel
+        self._plausibility = Plausibility(self.model, max(COMMAND_MEMORY, gains.d_max))
+        self._saturation = Saturation(config.saturation_ns)
+        self.restart()
+
+    def restart(self) -> None:
+        """Begin a new epoch of the plant: nothing measured yet, the elevator neutral, the reference at rest."""
+        self.reference = self._new_reference()
+        self.chooser = SetChooser(self.windows)
+        self._chosen = ChosenSets(self.windows)
+        self._plausibility.forget()
+        self._saturation.told(saturated=False, now_ns=0)
+        self._u, self._saturated = self.travel.neutral, False
+        self._last: Sample | None = None
+        self._first_j: int | None = None
+        self._fresh_ns: int | None = None
+        self._next_repeat_ns: int | None = None
+        self._reported: int | None = None
+        self._clock_known = False
+        self._eased = False
+
+    @property
+    def mode(self) -> Mode:
+        """Who has the elevator."""
+        return self.failsafe.mode
+
+    @property
+    def last(self) -> Sample | None:
+        """The newest sample of the epoch."""
+        return self._last
+
+    # One command per sample
+
+    def fly(self, sample: Sample, forecast: DelayEstimate, clock_known: bool, now_ns: int) -> Command:
+        """Return the command of a sample that is newer than the last.
+
+        Parameters
+        ----------
+        sample : Sample
+            The state.
+        forecast : DelayEstimate
+            Of the command that leaves now.
+        clock_known : bool
+            Whether the plant's clock is.
+        now_ns : int
+            Own time.
+        """
+        was = self.mode
+        if self._fresh_ns is not None and now_ns - self._fresh_ns > self._stale_ns():
+            self.event(Event.STALE, "a gap before this sample", now_ns)
+        if self._clock_known and not clock_known:
+            self.event(Event.CLOCK_LOST, "plant clock lost", now_ns)
+        self._fresh_ns, self._last, self._clock_known = now_ns, sample, clock_known
+        if self._first_j is None:
+            self._first_j = sample.j
+        event, reason = self._worth(sample, forecast)
+        self.event(event, reason, now_ns)
+        gain_set = self.chooser.choose(forecast.d, forecast.low, forecast.high)
+        self._chosen.note(sample.j, gain_set)
+        law, gains, gain_set = self._in_force(gain_set)
+        xr = self._look(sample, forecast, gains, was)
+        self._input(law, sample, xr)
+        if event_ := self._saturation.told(self._saturated, now_ns):
+            self.event(event_, "elevator at its limit", now_ns)
+            self._input(self._in_force(gain_set)[0], sample, xr)
+        self._plausibility.commanded(self._u)
+        self._next_repeat_ns = now_ns + self.model.Ts_ns
+        return Command(now_ns, sample, forecast, xr, self._u, self._saturated, self.mode, gain_set)
+
+    def _worth(self, sample: Sample, forecast: DelayEstimate) -> tuple[Event, str]:
+        """Return what a sample is to failsafe, and why."""
+        verdict = self._plausibility.judge(sample.j, sample.x)
+        if verdict is not None:
+            return verdict.event, verdict.reason
+        if forecast.d is None:
+            return Event.OUTSIDE, "delay unknown"
+        law, wide = self.config.gains, self.conservative
+        # before the narrower law is believed in again, the plant's own word counts as much as the forecast
+        delays = (forecast.d,) if wide is None or self._reported is None else (forecast.d, self._reported)
+        inside = all(_holds(law, d) for d in delays)
+        if inside and self._clock_known:
+            return Event.GOOD, f"delay {forecast.d}"
+        reason = "plant clock unknown" if inside else f"delay {max(delays)}"
+        usable = wide is not None and all(_holds(wide, d) for d in delays)
+        return Event.WIDE if usable else Event.OUTSIDE, reason
+
+    def _in_force(self, gain_set: int) -> tuple[Law | None, Gains, int]:
+        """Return the law that computes the command, if any, with its gains and the number of its set."""
+        if self.config.failsafe == "on":
+            if self.mode is Mode.CONSERVATIVE and self.conservative is not None:
+                return self._conservative_law, self.conservative, len(self.sets)
+            if self.mode not in FLOWN_BY_LAW:
+                return None, self.sets[gain_set], gain_set
+        return self._laws[gain_set], self.sets[gain_set], gain_set
+
+    def _input(self, law: Law | None, sample: Sample, xr: tuple[float, ...]) -> None:
+        """Set the input: the law's, the one held, or neutral."""
+        if law is not None:
+            self._u, self._saturated = law.command(sample.x, xr)
+        elif self.mode is not Mode.HOLD:
+            self._u, self._saturated = self.travel.neutral, False
+
+    # The reference
+
+    def _look(self, sample: Sample, forecast: DelayEstimate, gains: Gains, was: Mode) -> tuple[float, ...]:
+        """Return the reference state that the command carries: xr(j + d)."""
+        reference = self.reference
+        if reference is None:
+            return ()
+        reference.advance(sample.j)
+        if self._eased is not self.failsafe.ground_lost:
+            self._eased = self.failsafe.ground_lost
+            reference.follow(Profile() if self._eased else self.config.profile)
+        ahead = 0
+        if self.config.align:
+            ahead = min(forecast.d, MAX_AHEAD) if forecast.d is not None else self.config.gains.d_min
+        if self.config.failsafe == "on" and _enters(was, self.mode):
+            self._match_reference(reference, sample, gains, ahead)
+        return reference.ahead(ahead)
+
+    def _match_reference(self, reference: ReferenceModel, sample: Sample, gains: Gains, ahead: int) -> None:
+        """Let the reference go on from where the aircraft is: a law takes over without a jump of the elevator."""
+        if gains.K2 is None:
+            return
+        dx = np.array(sample.x) - self.model.trim.x
+        du, step_ahead = self._u - self.travel.neutral, reference.step_ahead(ahead)
+        reference.set(match_reference(self.model, gains.K1, gains.K2, dx, du, step_ahead))
+
+    def prepare(self) -> None:
+        """Compute what the next command will look ahead to, while nothing waits for it."""
+        if self.reference is not None:
+            widest = self.config.gains if self.conservative is None else self.conservative
+            self.reference.ahead(widest.d_max + 1)
+
+    def _new_reference(self) -> ReferenceModel | None:
+        if self.model.reference is None:
+            return None
+        return ReferenceModel(self.model.reference, self.config.profile)
+
+    # What else happens
+
+    def event(self, event: Event, reason: str, now_ns: int) -> None:
+        """Let failsafe take one event, and tell of a change of mode."""
+        before = self.failsafe.mode
+        self.failsafe = step(self.failsafe, event, now_ns, self.limits)
+        after = self.failsafe.mode
+        if after is before:
+            return
+        worse = after not in (Mode.TRACKING, Mode.STANDBY)
+        data = {"from": before, "to": after, "event": event, "monitor": self.config.failsafe == "monitor"}
+        text = f"{before} to {after}: {reason}"
+        self._tell(Notice(now_ns, Severity.WARNING if worse else Severity.NOTICE, text, data))
+
+    def reported(self, j: int, d: int, now_ns: int) -> bool:
+        """Take the delay of the command of sample j as the plant reports it; return whether it is one of ours."""
+        if self._first_j is None or j < self._first_j:
+            return False  # the command of an autopilot before this one, or of another epoch
+        self._reported = d
+        in_window = _holds(self.config.gains, d)
+        fits = in_window
+        if self.conservative is not None and self.mode not in (Mode.TRACKING, Mode.LEVEL):
+            fits = _holds(self.conservative, d)
+        if not fits:
+            self.event(Event.OUTSIDE, f"delay {d} reported", now_ns)
+        elif in_window and not self._chosen.covers(j, d):
+            self.event(Event.OUTSIDE, f"delay {d} reported of another gain set", now_ns)
+        return True
+
+    def heard_ground(self, now_ns: int) -> None:
+        """Take a ground station's sign of life."""
+        if event := self.ground.heard(now_ns):
+            self.event(event, "ground station is back", now_ns)
+
+    def tick(self, now_ns: int) -> bool:
+        """Raise what is due by time alone; return whether neutral is to be sent again, as no sample comes."""
+        if event := self.ground.tick(now_ns):
+            self.event(event, "ground station lost", now_ns)
+        due_ns = self._mode_ends_ns()
+        if due_ns is None or now_ns < due_ns:
+            return False
+        if self.mode in FLOWN_BY_LAW:
+            self.event(Event.STALE, f"no state for {self._patience} samples", now_ns)
+        elif self.mode is Mode.HOLD:
+            self.event(Event.EXPIRED, "no recovery", now_ns)
+        if self.mode is not Mode.NEUTRAL or self._last is None or self.config.failsafe != "on":
+            return False
+        self._u, self._saturated = self.travel.neutral, False
+        self._plausibility.commanded(self._u)
+        self._saturation.told(saturated=False, now_ns=now_ns)
+        self._next_repeat_ns = now_ns + self.model.Ts_ns
+        return True
+
+    @property
+    def u(self) -> float:
+        """The input that was commanded last, absolute."""
+        return self._u
+
+    def next_deadline_ns(self) -> int | None:
+        """Return when ``tick`` is wanted if no sample comes."""
+        mode_ns, ground_ns = self._mode_ends_ns(), self.ground.deadline_ns()
+        if mode_ns is None or ground_ns is None:
+            return ground_ns if mode_ns is None else mode_ns
+        return min(mode_ns, ground_ns)
+
+    def _mode_ends_ns(self) -> int | None:
+        """Return when the present mode ends, or repeats its command, if no sample comes."""
+        match self.mode:
+            case Mode.TRACKING | Mode.LEVEL | Mode.CONSERVATIVE:
+                assert self._fresh_ns is not None
+                return self._fresh_ns + self._stale_ns()
+            case Mode.HOLD:
+                return self.failsafe.since_ns + self.limits.hold_ns
+            case Mode.NEUTRAL if self.config.failsafe == "on":
+                return self._next_repeat_ns
+            case _:
+                return None
+
+    @property
+    def _patience(self) -> int:
+        """The oldest state that the law in force may use, samples."""
+        if self.mode is Mode.CONSERVATIVE and self.conservative is not None:
+            return self.conservative.d_max
+        return self.config.gains.d_max
+
+    def _stale_ns(self) -> int:
+        """Return the age at which a state is stale: d_max samples, and a little for clocks that differ."""
+        return self._patience * self.model.Ts_ns + self.model.Ts_ns // 4
+
+
+def _holds(gains: GainLaw, d: int) -> bool:
+    """Return whether the window of gains, or of a schedule, contains a delay."""
+    return gains.d_min <= d <= gains.d_max
+
+
+def _enters(was: Mode, mode: Mode) -> bool:
+    """Return whether a law takes over from the last command, from neutral, or from the other law."""
+    if was is Mode.STANDBY or mode not in FLOWN_BY_LAW:
+        return False
+    return was not in FLOWN_BY_LAW or (was is Mode.CONSERVATIVE) is not (mode is Mode.CONSERVATIVE)
