@@ -127,9 +127,8 @@ class AutopilotNode:
             self._announce_gains(now_ns)
         untold, self._untold = self._untold, []
         for command in untold:
+            self.pilot.sent(command)
             self._tell(command)
-        if untold:
-            self.pilot.prepare()
         self._renew_delay(now_ns)
         self._tick_plant_link(now_ns)
         last = self.pilot.last
@@ -182,10 +181,10 @@ class AutopilotNode:
         if self.samples.jumped_back and self._plant_restarted():
             self._new_epoch(now_ns)
             sample = self.samples.add(message, now_ns, peer_ns)
-        if missing := self.halves.came(type(message), now_ns):
-            self._half_missing(missing, now_ns)
         if sample is not None:
             self._command(sample, peer_ns is not None, now_ns)
+        if missing := self.halves.came(type(message), now_ns):
+            self._half_missing(missing, now_ns)
 
     def _half_missing(self, missing: str, now_ns: int) -> None:
         """Say that half of the state has stopped coming, unless it need not come."""

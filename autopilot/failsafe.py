@@ -183,6 +183,9 @@ def step(state: FailsafeState, event: Event, now_ns: int, limits: Limits) -> Fai
     after SATURATED, are believed only when the time has really passed, so the caller may raise EXPIRED on every
     tick. A lost ground station is remembered: a change to TRACKING then goes on to LEVEL.
     """
+    longest = max(limits.good_samples, limits.calm_samples)
+    if event is Event.GOOD and state.mode is Mode.TRACKING and state.good_in_a_row == longest:
+        return state  # as nearly always, right between a packet in and a packet out
     if event is Event.WIDE and not limits.conservative:
         event = Event.OUTSIDE
     good, usable = _rows(state, event, limits)

@@ -100,6 +100,7 @@ class Pilot:
         self.limits = Limits(config.hold_ns, conservative=self.conservative is not None)
         self.ground = Silence(config.ground_timeout_ns)
         self._tell = tell
+        self._Ts_ns = self.model.Ts_ns
         self._laws = [law_of(each) for each in self.sets]
         self._conservative_law = law_of(self.conservative) if self.conservative is not None else None
         self.travel = self._laws[0].travel
@@ -159,17 +160,25 @@ class Pilot:
             self._first_j = sample.j
         event, reason = self._worth(sample, forecast)
         self.event(event, reason, now_ns)
-        gain_set = self.chooser.choose(forecast.d, forecast.low, forecast.high)
-        self._chosen.note(sample.j, gain_set)
-        law, gains, gain_set = self._in_force(gain_set)
+        chosen = self.chooser.choose(forecast.d, forecast.low, forecast.high)
+        law, gains, gain_set = self._in_force(chosen)
         xr = self._look(sample, forecast, gains, was)
-        self._input(law, sample, xr)
-        if event_ := self._saturation.told(self._saturated, now_ns):
-            self.event(event_, "elevator at its limit", now_ns)
-            self._input(self._in_force(gain_set)[0], sample, xr)
-        self._plausibility.commanded(self._u)
-        self._next_repeat_ns = now_ns + self.model.Ts_ns
+        if law is not None:
+            self._u, self._saturated = law.command(sample.x, xr)
+        elif self.mode is not Mode.HOLD:
+            self._u, self._saturated = self.travel.neutral, False
         return Command(now_ns, sample, forecast, xr, self._u, self._saturated, self.mode, gain_set)
+
+    def sent(self, command: Command) -> None:
+        """Take note of a command that has left; what follows from it alone could wait until now."""
+        self._chosen.note(command.sample.j, self.chooser.present)
+        self._plausibility.commanded(command.u)
+        self._next_repeat_ns = command.at_ns + self._Ts_ns
+        if event := self._saturation.told(command.saturated, command.at_ns):
+            self.event(event, "elevator at its limit", command.at_ns)
+        if self.reference is not None:  # what the next command will look ahead to
+            widest = self.config.gains if self.conservative is None else self.conservative
+            self.reference.ahead(widest.d_max + 1)
 
     def _worth(self, sample: Sample, forecast: DelayEstimate) -> tuple[Event, str]:
         """Return what a sample is to failsafe, and why."""
@@ -197,13 +206,6 @@ class Pilot:
                 return None, self.sets[gain_set], gain_set
         return self._laws[gain_set], self.sets[gain_set], gain_set
 
-    def _input(self, law: Law | None, sample: Sample, xr: tuple[float, ...]) -> None:
-        """Set the input: the law's, the one held, or neutral."""
-        if law is not None:
-            self._u, self._saturated = law.command(sample.x, xr)
-        elif self.mode is not Mode.HOLD:
-            self._u, self._saturated = self.travel.neutral, False
-
     # The reference
 
     def _look(self, sample: Sample, forecast: DelayEstimate, gains: Gains, was: Mode) -> tuple[float, ...]:
@@ -229,12 +231,6 @@ class Pilot:
         dx = np.array(sample.x) - self.model.trim.x
         du, step_ahead = self._u - self.travel.neutral, reference.step_ahead(ahead)
         reference.set(match_reference(self.model, gains.K1, gains.K2, dx, du, step_ahead))
-
-    def prepare(self) -> None:
-        """Compute what the next command will look ahead to, while nothing waits for it."""
-        if self.reference is not None:
-            widest = self.config.gains if self.conservative is None else self.conservative
-            self.reference.ahead(widest.d_max + 1)
 
     def _new_reference(self) -> ReferenceModel | None:
         if self.model.reference is None:
@@ -291,7 +287,7 @@ class Pilot:
         self._u, self._saturated = self.travel.neutral, False
         self._plausibility.commanded(self._u)
         self._saturation.told(saturated=False, now_ns=now_ns)
-        self._next_repeat_ns = now_ns + self.model.Ts_ns
+        self._next_repeat_ns = now_ns + self._Ts_ns
         return True
 
     @property
@@ -328,7 +324,7 @@ class Pilot:
 
     def _stale_ns(self) -> int:
         """Return the age at which a state is stale: d_max samples, and a little for clocks that differ."""
-        return self._patience * self.model.Ts_ns + self.model.Ts_ns // 4
+        return self._patience * self._Ts_ns + self._Ts_ns // 4
 
 
 def _holds(gains: GainLaw, d: int) -> bool:

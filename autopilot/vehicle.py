@@ -6,7 +6,7 @@ name and on its own clock.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 from autopilot.link.clock import NS_PER_MS, NS_PER_S, NS_PER_US, following
 from autopilot.link.node import Datagram
@@ -102,10 +102,19 @@ class Vehicle:
 
     def show(self, message: Message, now_ns: int) -> None:
         """Repeat a message under our name, on our clock, at the next tick."""
-        if isinstance(message, Attitude | NamedValueFloat | NamedValueInt):
-            message = replace(message, time_boot_ms=now_ns // NS_PER_MS)
-        elif isinstance(message, AoaSsa | ServoOutputRaw):
-            message = replace(message, time_usec=now_ns // NS_PER_US)
+        match message:
+            case Attitude(_, roll, pitch, yaw, rollspeed, pitchspeed, yawspeed):
+                message = Attitude(now_ns // NS_PER_MS, roll, pitch, yaw, rollspeed, pitchspeed, yawspeed)
+            case AoaSsa():
+                message = AoaSsa(now_ns // NS_PER_US, message.AOA, message.SSA)
+            case ServoOutputRaw():
+                message = ServoOutputRaw(now_ns // NS_PER_US, message.servo2_raw)
+            case NamedValueInt():
+                message = NamedValueInt(now_ns // NS_PER_MS, message.name, message.value)
+            case NamedValueFloat():
+                message = NamedValueFloat(now_ns // NS_PER_MS, message.name, message.value)
+            case _:
+                pass
         self._wait(message)
 
     def say(self, severity: int, text: str) -> None:

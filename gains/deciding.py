@@ -216,7 +216,10 @@ def run_schedule(names: Sequence[str], output: Path, transitions: Transitions, d
     model = sets[0].model
     if delta > 0.0 and model.uncertainty is None:
         raise InputError(f"--delta: expected 0, as model {model.name} has no [uncertainty], found {delta:g}")
-    named = tuple(replace(own, name=f"{output.stem}[{i}]", model=model, certificate=None) for i, own in enumerate(sets))
+    named = tuple(
+        replace(own, name=f"{output.stem}[{i}]", model=model, certificate=None, conservative=None)
+        for i, own in enumerate(sets)
+    )
     law = Schedule(output.stem, model, named)
     question = Question(law, law.d_min, law.d_max, transitions, delta, 0, True)
     return run_certify(question, names[0], output, as_json=as_json)

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from gains.command import NEGATIVE, SUCCESS, FiniteRange, print_json, require_writable, version
+from gains.gainfile import check_conservative
 from gains.model import GainLaw, Gains, Schedule
 from gains.store import DELAY_LIMIT, load_gains, load_law, model_path, save_gains
 from gains.table import InputError
@@ -112,6 +113,8 @@ def certify(
         raise InputError(
             f"--delay: expected a window around {law.d_min}:{law.d_max}, the schedule's, found {d_min}:{d_max}"
         )
+    if output is not None:  # before the work, not after it
+        check_conservative(str(output), law if isinstance(law, Schedule) else replace(law, d_min=d_min, d_max=d_max))
     if method == "exact":
         from gains.deciding import Question, run_certify  # with the solver: listing and showing do without
 

@@ -71,6 +71,7 @@ METRICS = frozenset(
         "max_output_rad",
         "delay.estimated_exact_fraction",
         "delay.within_one_fraction",
+        "delay.covered_fraction",
         "delay.unknown_fraction",
         *(f"link.{way}.{n}" for way in ("up", "down") for n in LINK_COUNTS),
         "failsafe_events",

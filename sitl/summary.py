@@ -119,13 +119,16 @@ def delay_summary(flight: FlightData) -> dict[str, Any]:
     for k, j in zip(flight.k, flight.j, strict=True):
         if not np.isnan(j):
             first.setdefault(int(j), int(k - j))
-    forecasts = dict(zip(flight.command_j.tolist(), flight.forecast.tolist(), strict=True))
-    misses = [forecasts[j] - d for j, d in first.items() if j in forecasts]
-    known = np.array([miss for miss in misses if not np.isnan(miss)])
+    forecast = np.column_stack([flight.forecast, flight.forecast_low, flight.forecast_high])
+    forecasts = dict(zip(flight.command_j.tolist(), forecast, strict=True))
+    misses = np.array([forecasts[j] - d for j, d in first.items() if j in forecasts]).reshape(-1, 3)
+    misses = misses[~np.isnan(misses[:, 0])]
+    known, covered = misses[:, 0], (misses[:, 1] <= 0) & (misses[:, 2] >= 0)
     return {
         "true_histogram": {str(d): n for d, n in sorted(Counter(true.tolist()).items())},
         "estimated_exact_fraction": float(np.mean(known == 0)) if known.size else None,
         "within_one_fraction": float(np.mean(np.abs(known) <= 1)) if known.size else None,
+        "covered_fraction": float(np.mean(covered)) if known.size else None,
         "unknown_fraction": float(np.mean(np.isnan(flight.forecast))) if flight.forecast.size else None,
     }
 
@@ -156,7 +159,7 @@ def link_summary(kept: Iterable[Kept]) -> dict[str, dict[str, int]]:
 
 
 def failsafe_reaction_samples(kept: Iterable[Kept], scenario: Scenario) -> float | None:
-    """Return how long the autopilot stayed in TRACKING with the delay outside the gains' window; None if it never was.
+    """Return how long the law flew on (TRACKING, LEVEL) with the delay outside the gains' window; None if it never was.
 
     In samples, the longest of the flight: from the record of a sample whose delay lies outside, as the plant
     reports it, or of a command forecast to land outside, to the failsafe leaving TRACKING or the end.
@@ -175,7 +178,7 @@ def failsafe_reaction_samples(kept: Iterable[Kept], scenario: Scenario) -> float
     longest_ns = None
     for at_ns in outside_ns:
         following = bisect_left(changes, at_ns - SAME_INSTANT_NS, key=lambda change: change[0])
-        if following and changes[following - 1][1] is Mode.TRACKING:
+        if following and changes[following - 1][1] in (Mode.TRACKING, Mode.LEVEL):
             left_ns = changes[following][0] if following < len(changes) else end_ns
             longest_ns = max(longest_ns or 0, left_ns - at_ns)
     return None if longest_ns is None else longest_ns / scenario.plant.Ts_ns
@@ -274,7 +277,8 @@ def _forecast_text(delay: Mapping[str, Any]) -> str:
     if delay["estimated_exact_fraction"] is None:
         return "none scored"
     exact, near = delay["estimated_exact_fraction"], delay["within_one_fraction"]
-    return f"exact {exact:.1%}, within one sample {near:.1%}, unknown {delay['unknown_fraction']:.1%}"
+    covered, unknown = delay["covered_fraction"], delay["unknown_fraction"]
+    return f"exact {exact:.1%}, within one sample {near:.1%}, inside the interval {covered:.1%}, unknown {unknown:.1%}"
 
 
 def _witness_text(witness: Mapping[str, Any]) -> str:

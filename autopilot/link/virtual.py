@@ -106,10 +106,12 @@ class VirtualNetwork:
 
     def _earliest(self) -> int:
         """Return the node whose tick is due first, the first of equals."""
-        earliest, first_ns = 0, self._due[0]
+        earliest, first_ns, now_ns = 0, None, self.now_ns
         for i, due_ns in enumerate(self._due):
-            if due_ns is not None and (first_ns is None or max(due_ns, self.now_ns) < max(first_ns, self.now_ns)):
+            if due_ns is not None and (first_ns is None or due_ns < first_ns):
                 earliest, first_ns = i, due_ns
+                if due_ns <= now_ns:
+                    break  # what is overdue is due now, and of equals the first counts
         return earliest
 
     def _schedule(self, i: int) -> None:

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from rich.console import Console
 from rich.table import Table
 
-from tests.bench import certify, design, exact, flight, turnaround
+from tests.bench import certify, design, estimators, exact, flight, turnaround
 
 
 @dataclass(frozen=True)
@@ -30,6 +30,7 @@ def main() -> int:
     benches: list[Callable[[], list[tuple[str, float, float, str]]]] = [
         certify.measure,
         design.measure,
+        estimators.measure,
         exact.measure,
         flight.measure,
         turnaround.measure,
