@@ -24,7 +24,6 @@ import math
 from bisect import bisect_left, bisect_right
 from collections import deque
 from enum import StrEnum
-from operator import mul
 from typing import NamedTuple
 
 import numpy as np
@@ -58,9 +57,9 @@ STALE_NS = 5 * NS_PER_S
 FORGET_NS = 30 * NS_PER_S
 """Transits from before so long a silence describe the link no more."""
 
-RENEW_TRANSITS = 80
+RENEW_TRANSITS = 160
 """The law is renewed after so many new transits at the latest, earlier while there are few,"""
-RENEW_REPORTS = 320
+RENEW_REPORTS = 640
 """or after so many reports."""
 RENEW_SHARE = 4
 """While there are few: when the new ones are one in so many."""
@@ -80,6 +79,8 @@ SUSPECT_LEVEL = 0.4
 """off their middle by so much of at most one half, by chance once in 50,000 suspicions."""
 SHIFT_REPORTS = 256
 """The latest reports, which decide the shift; after a suspicion only those since then."""
+MAX_SPREAD = 1000
+"""Delays that a forecast looks at, whatever transits a peer makes us believe in."""
 MAX_TIME_NS = 1 << 60
 """No clock shows more, 36 years; what does is refused."""
 SCORES = 1000
@@ -198,7 +199,7 @@ class DelayEstimator:
         self._law: TransitLaw | None = None
         self._line = ClockLine(0, 0, 0.0)
         self._skew = 0.0
-        self._certain = 0.0
+        self._certain = self._enough = 0.0
         self._status = DelayStatus.UNKNOWN
         self._heard_ns = self._transit_ns = 0
 
@@ -228,12 +229,15 @@ class DelayEstimator:
         n = len(self._levels)
         mean = abs(sum(self._levels)) / n
         sigma = math.sqrt((1.0 / n + 1.0 / known) / 12.0)  # of two samples of one distribution (Mann and Whitney)
+        new = _at_one_end(self._levels)
         if self._suspected:
             self._in_doubt += 1
-            n = _at_one_end(self._levels)
-        if n >= SUSPECT_TRANSITS if self._suspected else n == CHANGE_TRANSITS and mean > CHANGE_SIGMA * sigma:
+            changed = new >= SUSPECT_TRANSITS
+        else:
+            changed = n == CHANGE_TRANSITS and mean > CHANGE_SIGMA * sigma
+        if changed:
             self.changes += 1
-            self._restart(n)
+            self._restart(new if new >= MIN_TRANSITS else n)
         elif len(self._levels) == CHANGE_TRANSITS:
             self._suspected, self._in_doubt = False, 0  # commands travel otherwise now, TIMESYNC does not: a shift
 
@@ -338,6 +342,7 @@ class DelayEstimator:
         self._density = self._law.density
         n = len(self._law.transits)
         self._certain = n / (n + 1)
+        self._enough = COVERAGE / self._certain
         self._status = DelayStatus.ESTIMATED if n >= MANY_TRANSITS else DelayStatus.CONVERGING
 
     def _restart(self, transits: int) -> None:
@@ -379,7 +384,8 @@ class DelayEstimator:
         law, Ts_ns = self._law, self.Ts_ns
         if law is None or now_ns - self._heard_ns > STALE_NS:
             return UNKNOWN
-        age_ns = self._age_ns(sample_ns, now_ns)
+        line = self._line
+        age_ns = now_ns + line.offset_ns + round((now_ns - line.t_ref_ns) * self._skew) - sample_ns
         transits, levels = law.transits, law.levels
         first = -(-(age_ns + transits[0]) // Ts_ns)
         last = -(-(age_ns + transits[-1]) // Ts_ns)
@@ -387,23 +393,22 @@ class DelayEstimator:
             first, last = 1, max(1, last)
         if first == last:
             return DelayEstimate(first, first, first, self._certain, self._status)
-        weights, before, limit_ns = [], 0.0, first * Ts_ns - age_ns
-        for _ in range(first, last):
-            level = levels[bisect_right(transits, limit_ns)]
-            weights.append(level - before)
+        last = min(last, first + MAX_SPREAD)
+        opened = law.open_at(age_ns, last)
+        weights, total, before, limit_ns = [], 0.0, 0.0, first * Ts_ns - age_ns
+        for m in range(first, last + 1):
+            level = levels[bisect_right(transits, limit_ns)] if m < last else 1.0
+            weight = (level - before) * opened[m]
+            weights.append(weight)
+            total += weight
             before, limit_ns = level, limit_ns + Ts_ns
-        weights.append(1.0 - before)
-        if law.open:
-            bin_ = min(max((age_ns - law.first_age_ns) // law.bin_ns, 0), len(law.open) - 1)
-            weights = _applied_only(weights, law.open[bin_][first : last + 1])
-        return self._summary(first, weights)
+        return self._summary(first, weights, total)
 
-    def _summary(self, first: int, weights: list[float]) -> DelayEstimate:
+    def _summary(self, first: int, weights: list[float], total: float) -> DelayEstimate:
         """Return the likeliest of the delays from ``first`` on, and the interval around it."""
-        total = sum(weights)
         best = weights.index(max(weights))
         low = high = best
-        covered, enough, last = weights[best], COVERAGE * total / self._certain, len(weights) - 1
+        covered, enough, last = weights[best], self._enough * total, len(weights) - 1
         while covered < enough and (low > 0 or high < last):
             if high == last or (low > 0 and weights[low - 1] >= weights[high + 1]):
                 low -= 1
@@ -424,11 +429,3 @@ def _at_one_end(levels: deque[float]) -> int:
             break
         n += 1
     return n
-
-
-def _applied_only(weights: list[float], opened: list[float]) -> list[float]:
-    """Return the weights of delays times the probabilities that no newer command comes in time."""
-    if len(opened) < len(weights):
-        opened = opened + (opened[-1:] or [1.0]) * (len(weights) - len(opened))
-    applied = list(map(mul, weights, opened))
-    return applied if any(applied) else weights

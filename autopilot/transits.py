@@ -51,6 +51,8 @@ ITERATIONS = 2
 
 MAX_NEWER = 4
 """Newer commands that are looked at: the fifth would have to gain five samples."""
+LEAST_OPEN = 1e-6
+"""What is applied against all odds has a probability all the same."""
 MAX_BINS = 256
 """Bins of the ages."""
 BINS_PER_SAMPLE = 25
@@ -103,6 +105,13 @@ class TransitLaw:
     open: list[list[float]]
     density: Floats
 
+    def open_at(self, age_ns: int, last: int) -> list[float]:
+        """Return the open[m] of an age, for m up to ``last`` at least; all are above 0."""
+        if not self.open:
+            return [1.0] * (last + 1)
+        row = self.open[min(max((age_ns - self.first_age_ns) // self.bin_ns, 0), len(self.open) - 1)]
+        return row if last < len(row) else row + row[-1:] * (last + 1 - len(row))
+
 
 def transit_law(transits: Ints, ages: Ints, reports: Reports, Ts_ns: int, density: Floats) -> TransitLaw:
     """Return the law that transits, ages and reports describe.
@@ -126,10 +135,10 @@ def transit_law(transits: Ints, ages: Ints, reports: Reports, Ts_ns: int, densit
     slots = 0 if ages.size == 0 else int(-(-(int(ages.max()) + int(transits[-1])) // Ts_ns)) + 1
     if 1 < slots <= MAX_SLOTS:
         first, width, counts = _bins(ages, Ts_ns)
-        opened = _open(transits, counts, first, width, Ts_ns, slots)
+        opened = _open(transits, _levels_of(density), counts, first, width, Ts_ns, slots)
         if reports.d.size >= MIN_REPORTS:
             density = _correct(transits, opened, first, width, Ts_ns, reports, density)
-    levels = np.interp(np.arange(n + 1) / n, _EDGES, np.concatenate([[0.0], np.cumsum(density * _WIDTHS)]))
+    levels = np.interp(np.arange(n + 1) / n, _EDGES, _levels_of(density))
     return TransitLaw(transits.tolist(), levels.tolist(), first, width, opened.tolist(), density)
 
 
@@ -161,6 +170,11 @@ def least_shift(reports: Reports, shortest_ns: int, longest_ns: int, Ts_ns: int)
     return int(best[np.argmin(np.abs(best))] if apart else middle)
 
 
+def _levels_of(density: Floats) -> Floats:
+    """Return H at the edges of its bins."""
+    return np.concatenate([[0.0], np.cumsum(density * _WIDTHS)])
+
+
 def _bins(ages: Ints, Ts_ns: int) -> tuple[int, int, Floats]:
     """Return the first left end, the width and the shares of the bins of the ages."""
     first, last = int(ages.min()), int(ages.max())
@@ -169,7 +183,7 @@ def _bins(ages: Ints, Ts_ns: int) -> tuple[int, int, Floats]:
     return first, width, counts / ages.size
 
 
-def _open(transits: Ints, counts: Floats, first: int, width: int, Ts_ns: int, slots: int) -> Floats:
+def _open(transits: Ints, H: Floats, counts: Floats, first: int, width: int, Ts_ns: int, slots: int) -> Floats:
     """Return the probability per bin of ages and slot m (0 to slots) that no newer command is in time for m.
 
     The i-th newer command has not left yet, so its age exceeds a - i Ts; it comes in time when its own loop time
@@ -178,7 +192,7 @@ def _open(transits: Ints, counts: Floats, first: int, width: int, Ts_ns: int, sl
     bins = counts.size
     centres = first + (np.arange(bins) + 0.5) * width
     loop_ns = np.arange(slots + 1) * Ts_ns
-    in_time = np.searchsorted(transits, loop_ns[:, None] - centres, "right") / transits.size
+    in_time = np.interp(np.searchsorted(transits, loop_ns[:, None] - centres, "right") / transits.size, _EDGES, H)
     joint = _from_the_right(counts * in_time)  # [y, b] = P(loop time <= y Ts, age in bin b or later)
     later = _from_the_right(counts)
     opened = np.ones((bins, slots + 1))
@@ -186,7 +200,7 @@ def _open(transits: Ints, counts: Floats, first: int, width: int, Ts_ns: int, sl
         bin_ = np.clip(np.ceil((centres - i * Ts_ns - first) / width), 0, bins).astype(np.int64)
         share = np.divide(joint[:, bin_], later[bin_], out=np.zeros((slots + 1, bins)), where=later[bin_] > 0.0)
         opened[:, i + 1 :] *= 1.0 - share[1 : slots + 1 - i].T
-    return opened
+    return np.maximum(opened, LEAST_OPEN)
 
 
 def _from_the_right(shares: Floats) -> Floats:

@@ -70,7 +70,9 @@ def record() -> tuple[list[Call], int]:
     autopilot.clock = Tapped(autopilot.clock, "clock", calls)  # type: ignore[attr-defined]
     autopilot.delay = Tapped(autopilot.delay, "delay", calls)  # type: ignore[attr-defined]
     network.run(lambda: plant.samples >= scenario.samples, 10**12)
-    return calls, sum(what == "sent" for _, what, _ in calls)
+    samples = sum(what == "sent" for _, what, _ in calls)
+    assert samples > 0.9 * scenario.samples, "the estimators are used behind the tap's back"
+    return calls, samples
 
 
 def _bound(calls: list[Call]) -> list[tuple[Callable[..., Any], tuple[Any, ...]]]:
