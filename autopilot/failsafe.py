@@ -162,6 +162,9 @@ class FailsafeState:
         The same of samples that are GOOD or WIDE.
     resting : bool
         Whether SATURATED led to this NEUTRAL, which then lasts its least time.
+    cautious : bool
+        Whether the conservative gains flew last: then only CALM, and no short row of GOOD samples, gives the first
+        law back, even where a HOLD lies between.
     ground_lost : bool
         Whether the ground station is lost, in any mode: CONSERVATIVE has no mode of its own for it, and its
         reference is to be eased to zero all the same.
@@ -172,6 +175,7 @@ class FailsafeState:
     good_in_a_row: int = 0
     usable_in_a_row: int = 0
     resting: bool = False
+    cautious: bool = False
     ground_lost: bool = False
 
 
@@ -195,7 +199,9 @@ def step(state: FailsafeState, event: Event, now_ns: int, limits: Limits) -> Fai
     if ground_lost:
         mode = TRANSITIONS.get((mode, Event.GROUND_LOST), mode)
     if mode is not state.mode:
-        return FailsafeState(mode, now_ns, resting=event is Event.SATURATED, ground_lost=ground_lost)
+        cautious = mode is Mode.CONSERVATIVE or (state.cautious and mode in (Mode.HOLD, Mode.NEUTRAL))
+        resting = event is Event.SATURATED
+        return FailsafeState(mode, now_ns, resting=resting, cautious=cautious, ground_lost=ground_lost)
     if (good, usable, ground_lost) == (state.good_in_a_row, state.usable_in_a_row, state.ground_lost):
         return state
     return replace(state, good_in_a_row=good, usable_in_a_row=usable, ground_lost=ground_lost)
@@ -228,10 +234,12 @@ def _meanings(event: Event, good: int, usable: int, limits: Limits) -> list[Even
 
 
 def _believed(state: FailsafeState, event: Event, now_ns: int, limits: Limits) -> bool:
-    """Return whether the time for an event has come, and the gains that it asks for are there."""
+    """Return whether the time for an event has come, and the gains that it asks for are there and may fly."""
     here_ns = now_ns - state.since_ns
     if event is Event.EXPIRED:
         return here_ns >= limits.hold_ns
     if event is Event.WIDE_RECOVERED and not limits.conservative:
+        return False
+    if event is Event.RECOVERED and state.cautious:
         return False
     return event not in _ROWS or not state.resting or here_ns >= limits.rest_ns

@@ -30,11 +30,13 @@ of *good*, *wide*, *outside*, *implausible* and *frozen*; {GOOD_SAMPLES} samples
 `{COMMAND}`; do not edit it."""
 
 NOTES = f"""\
-Three rules stand beside the table:
+Four rules stand beside the table:
 
 * Without a second, conservative set of gains *wide* counts as *outside*, and CONSERVATIVE cannot be reached.
 * *expired* is believed only when HOLD has lasted its time. After *saturated*, NEUTRAL lasts at least
   {REST_NS / NS_PER_S:g} s, whatever the samples say.
+* After CONSERVATIVE only *calm* leads to TRACKING, also where HOLD or NEUTRAL lies between: nothing certifies the
+  switching of the two laws, so it must be rare.
 * A lost ground station is remembered in every mode: what leads to TRACKING then leads to LEVEL."""
 
 

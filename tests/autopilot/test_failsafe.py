@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from itertools import product
+from itertools import groupby, product
 from pathlib import Path
 
 import pytest
@@ -193,7 +193,7 @@ def test_one_good_sample_starts_the_law_even_when_it_completes_a_row_for_the_oth
 
 def test_no_sample_counts_for_two_changes_of_mode():
     state = run(FailsafeState(Mode.HOLD), [Event.WIDE, Event.GOOD, Event.GOOD], WITH_CONSERVATIVE)
-    assert state == FailsafeState(Mode.CONSERVATIVE, 10)
+    assert state == FailsafeState(Mode.CONSERVATIVE, 10, cautious=True)
     state = run(state, [Event.GOOD] * (CALM - 1), WITH_CONSERVATIVE)
     assert state.mode is Mode.CONSERVATIVE
     assert step(state, Event.GOOD, 10, WITH_CONSERVATIVE).mode is Mode.TRACKING
@@ -424,3 +424,20 @@ def test_the_page_is_written_by_its_command(tmp_path):
     words = COMMAND.split()
     subprocess.run([sys.executable, *words[1:-1], str(target)], check=True, cwd=Path(__file__).parents[2])
     assert target.read_text(encoding="utf-8") == page()
+
+
+def test_after_the_conservative_gains_a_hold_is_no_short_cut_to_the_law():
+    limits = Limits(hold_ns=HOLD_NS, conservative=True)
+    state, now_ns = FailsafeState(Mode.TRACKING), 0
+    flown = []
+    for event in [Event.WIDE] * 4 + [Event.OUTSIDE] + [Event.GOOD] * 43:
+        now_ns += 1
+        state = step(state, event, now_ns, limits)
+        flown.append(str(state.mode))
+    assert [mode for mode, _ in groupby(flown)] == ["HOLD", "CONSERVATIVE", "HOLD", "CONSERVATIVE", "TRACKING"]
+    assert flown[:5].count("CONSERVATIVE") == 1
+    assert flown[-3:] == ["CONSERVATIVE", "CONSERVATIVE", "TRACKING"]  # 3 GOOD samples, and then 40 calm ones
+    state = step(step(state, Event.OUTSIDE, now_ns + 1, limits), Event.GOOD, now_ns + 2, limits)
+    for later_ns in (3, 4):
+        state = step(state, Event.GOOD, now_ns + later_ns, limits)
+    assert state.mode is Mode.TRACKING  # the law itself flew last
