@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from autopilot.alpha import AlphaChoice
 from autopilot.app import AutopilotConfig, AutopilotNode
+from autopilot.failsafe import Mode
 from autopilot.link.clock import Clock
 from autopilot.link.process import format_clock, parse_clock
 from autopilot.reference import parse_profile
@@ -77,6 +78,7 @@ METRICS = frozenset(
         "failsafe_events",
         "failsafe_reaction_samples",
         "mode_at_end",
+        *(f"mode_s.{mode}" for mode in Mode),
         "longest_saturation_s",
         "reentry_saturation_s",
         "late_ticks",

@@ -87,6 +87,7 @@ def summarise(scenario: Scenario, kept: Sequence[Kept], flight: FlightData, *, v
         "failsafe_reaction_samples": failsafe_reaction_samples(kept, scenario),
         "failsafe_transitions": [t["text"] for t in transitions],
         "mode_at_end": flight.modes[-1].mode if flight.modes else Mode.STANDBY.value,
+        "mode_s": {mode.value: sum(m.end_s - m.start_s for m in flight.modes if m.mode == mode) for mode in Mode},
         "longest_saturation_s": _longest(_at_limit(flight)) * scenario.plant.Ts,
         "reentry_saturation_s": _reentry_saturation_s(flight),
         "late_ticks": int(np.count_nonzero(flight.late_ns > LATE_NS)),
