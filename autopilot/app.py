@@ -306,8 +306,8 @@ class AutopilotNode:
         """Send TIMESYNC and, once the delay can be forecast, the heartbeat that starts the plant."""
         assert self._started_ns is not None
         assert self._next_timesync_ns is not None
-        ready = self.delay.ready(now_ns) or now_ns - self._started_ns >= SYNC_WAIT_NS
-        if self._next_heartbeat_ns is None and ready:
+        waited_ns = now_ns - self._started_ns
+        if self._next_heartbeat_ns is None and (waited_ns >= SYNC_WAIT_NS or self.delay.ready(now_ns)):
             self._next_heartbeat_ns = now_ns
         if now_ns >= self._next_timesync_ns:
             starting = self._next_heartbeat_ns is None

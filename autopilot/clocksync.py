@@ -224,9 +224,13 @@ class ClockSync:
     def peer_at_most_ns(self, now_ns: int) -> int | None:
         """Return what the peer's clock shows at the most, for any rates; None while not locked."""
         interval = self._interval
-        if interval is None or interval.exchanges < MIN_EXCHANGES or now_ns - interval.at_ns > STALE_NS:
+        if interval is None:
             return None
-        return now_ns + interval.high_ns + _drift_ns(now_ns - interval.at_ns)
+        at_ns, _, high_ns, exchanges = interval
+        elapsed_ns = now_ns - at_ns
+        if exchanges < MIN_EXCHANGES or elapsed_ns > STALE_NS:
+            return None
+        return now_ns + high_ns - (-elapsed_ns * MAX_DRIFT_PPB // NS_PER_S)
 
     def _renew(self, newest: _Exchange) -> None:
         """Fit the lines again; when none fits, begin anew from the newest exchange, which always has one."""

@@ -40,8 +40,8 @@ COVERAGE = 0.95
 
 MAX_TRANSITS = 1024
 """Transits that describe the link: 100 s at 10 Hz."""
-MAX_REPORTS = 2048
-"""First delays that correct it."""
+MAX_REPORTS = 4096
+"""First delays that correct it, of two minutes and more: they decide the stated probability."""
 MAX_AGES = 1024
 """Ages that tell who overtakes."""
 MAX_SENT = 256

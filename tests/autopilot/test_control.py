@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from autopilot.control import TELL_NS, Law, SetChanges, Window, choose_set, law_of
+from autopilot.control import SETTLE_SAMPLES, TELL_NS, Law, SetChanges, SetChooser, Window, law_of
 from gains.model import Gains, Trim
 from gains.store import load_gains
 from gains.table import InputError
@@ -96,74 +96,168 @@ def schedules() -> Iterator[tuple[Window, ...]]:
 SCHEDULES = tuple(schedules())
 
 
-def room(window: Window, d: int) -> int:
-    """Return how far d is from the nearer end of its window."""
-    return min(d - window[0], window[1] - d)
+INTERVALS = tuple((low, high) for low in range(-1, 8) for high in range(low, 8))
 
 
-def test_the_chosen_set_has_a_window_that_contains_the_delay_whenever_any_has():
+def room(window: Window, low: int, high: int) -> int:
+    """Return how far an interval is from the nearer end of a window."""
+    return min(low - window[0], window[1] - high)
+
+
+def width(window: Window) -> int:
+    return window[1] - window[0]
+
+
+def in_force(windows: tuple[Window, ...], present: int) -> SetChooser:
+    chooser = SetChooser(windows)
+    chooser.present = present
+    return chooser
+
+
+def narrowest(windows: tuple[Window, ...], low: int, high: int) -> int | None:
+    """Return the set of the narrowest window around an interval, then with the most room, then the first."""
+    fit = [i for i, w in enumerate(windows) if w[0] <= low and high <= w[1]]
+    ranked = sorted(fit, key=lambda i: (width(windows[i]), -room(windows[i], low, high), i))
+    return ranked[0] if ranked else None
+
+
+def test_the_chosen_set_has_a_window_that_contains_the_interval_whenever_any_has():
     assert len(SCHEDULES) > 300
+    contained = 0
     for windows in SCHEDULES:
-        for d in range(windows[0][0], windows[-1][1] + 1):
+        for low, high in INTERVALS:
+            if narrowest(windows, low, high) is None:
+                continue
             for present in range(len(windows)):
-                low, high = windows[choose_set(windows, present, d)]
-                assert low <= d <= high
+                for d in {low, high}:
+                    chosen = windows[in_force(windows, present).choose(d, low, high)]
+                    assert chosen[0] <= low <= high <= chosen[1]
+                    contained += 1
+    assert contained > 10_000
 
 
-def test_the_present_set_stays_while_its_window_contains_the_delay():
+def test_the_present_set_stays_while_its_window_contains_the_interval_for_39_samples():
+    assert SETTLE_SAMPLES == 40
     for windows in SCHEDULES:
         for present, (low, high) in enumerate(windows):
-            assert {choose_set(windows, present, d) for d in range(low, high + 1)} == {present}
+            for interval in INTERVALS:
+                if low <= interval[0] and interval[1] <= high:
+                    chooser = in_force(windows, present)
+                    chosen = [chooser.choose(interval[0], *interval) for _ in range(39)]
+                    assert chosen == [present] * 39
+
+
+def test_a_new_set_is_the_one_with_the_narrowest_window_then_the_most_room_then_the_first():
+    ties = 0
+    for windows in SCHEDULES:
+        for low, high in INTERVALS:
+            best = narrowest(windows, low, high)
+            for present in range(len(windows)):
+                if best is not None and not (windows[present][0] <= low and high <= windows[present][1]):
+                    assert in_force(windows, present).choose(low, low, high) == best
+                    fit = [w for w in windows if w[0] <= low and high <= w[1]]
+                    ties += len({width(w) for w in fit}) < len(fit)
+    assert ties > 10
 
 
 def test_an_unknown_delay_or_one_outside_every_window_changes_nothing():
     for windows in SCHEDULES:
-        for d in DELAYS:
-            if d is None or not windows[0][0] <= d <= windows[-1][1]:
-                assert [choose_set(windows, i, d) for i in range(len(windows))] == list(range(len(windows)))
+        for present in range(len(windows)):
+            assert in_force(windows, present).choose(None, None, None) == present
+            for d in (-1, *range(8)):
+                if not windows[0][0] <= d <= windows[-1][1]:
+                    for low, high in ((d, d), (d - 1, d + 1), (-1, 8)):
+                        assert in_force(windows, present).choose(d, low, high) == present
 
 
-def test_a_new_set_is_the_one_with_the_most_room_then_the_narrowest_then_the_first():
-    ties = 0
+def test_an_interval_too_wide_for_every_window_leaves_the_choice_to_d():
     for windows in SCHEDULES:
         for present in range(len(windows)):
             for d in range(windows[0][0], windows[-1][1] + 1):
-                chosen = choose_set(windows, present, d)
-                if chosen == present:
+                chosen = in_force(windows, present).choose(d, -1, 8)
+                if windows[present][0] <= d <= windows[present][1]:
+                    assert chosen == present
                     continue
-                others = [i for i, (low, high) in enumerate(windows) if low <= d <= high and i != chosen]
-                low, high = windows[chosen]
-                for i in others:
-                    assert room(windows[i], d) <= room((low, high), d)
-                    if room(windows[i], d) == room((low, high), d):
-                        width = windows[i][1] - windows[i][0]
-                        assert high - low < width or (high - low == width and chosen < i)
-                        ties += 1
-    assert ties > 10
+                fit = [i for i, w in enumerate(windows) if w[0] <= d <= w[1]]
+                assert chosen == min(fit, key=lambda i: (-room(windows[i], d, d), width(windows[i]), i))
+
+
+def test_a_narrower_window_takes_over_with_the_fortieth_sample_in_a_row_and_a_wider_one_never_does():
+    took = 0
+    for windows in SCHEDULES:
+        for present in range(len(windows)):
+            low, high = windows[present]
+            for d in range(low, high + 1):
+                best = narrowest(windows, d, d)
+                chooser = in_force(windows, present)
+                chosen = [chooser.choose(d, d, d) for _ in range(50)]
+                narrower = width(windows[best]) < width(windows[present])
+                assert chosen == ([present] * 39 + [best] * 11 if narrower else [present] * 50)
+                took += narrower
+    assert took > 100
+
+
+def test_a_row_begins_anew_with_every_sample_that_breaks_it():
+    windows = ((1, 2), (1, 6), (3, 4))
+    for breaks in ((5, 5, 5), (1, 1, 6), (1, 0, 9), (3, 3, 3)):
+        chooser = in_force(windows, 1)
+        for _ in range(5):
+            assert {chooser.choose(1, 1, 2) for _ in range(39)} == {1}
+            assert chooser.choose(*breaks) == 1
+        assert [chooser.choose(1, 1, 2) for _ in range(40)][-2:] == [1, 0]
+
+
+def test_an_unknown_delay_breaks_no_row_and_makes_none():
+    chooser = in_force(((1, 2), (1, 6)), 1)
+    for _ in range(39):
+        chooser.choose(1, 1, 1)
+        chooser.choose(None, None, None)
+    assert chooser.present == 1
+    assert chooser.choose(1, 1, 1) == 0
 
 
 @pytest.mark.parametrize(
-    ("windows", "present", "d", "chosen"),
+    ("windows", "present", "interval", "chosen"),
     [
-        (((1, 3), (2, 6), (4, 9)), 0, 4, 1),  # room 2 against 0
-        (((1, 3), (2, 6), (4, 9)), 0, 6, 2),  # room 2 against 0
-        (((1, 1), (2, 4), (3, 6)), 0, 3, 1),  # room 1 against 0
-        (((1, 2), (3, 4)), 0, 3, 1),  # side by side
-        (((0, 6), (4, 9), (9, 12)), 2, 5, 1),  # room 1 each, and the second is narrower
-        (((0, 4), (2, 6), (5, 9)), 2, 3, 0),  # room 1 each, equally wide
-        (((0, 4), (2, 6), (5, 9)), 2, 2, 0),  # room 2 against 0
+        (((1, 3), (2, 6), (4, 9)), 0, (4, 4), 1),  # narrower by one
+        (((1, 3), (2, 6), (4, 9)), 0, (5, 7), 2),  # the only one
+        (((1, 1), (2, 4), (3, 5)), 0, (3, 3), 1),  # room 1 against 0
+        (((1, 1), (2, 4), (3, 5)), 0, (4, 4), 2),  # the same the other way round
+        (((1, 2), (3, 4)), 0, (3, 3), 1),  # side by side
+        (((1, 2), (3, 4)), 0, (2, 3), 0),  # too wide for both, and d stays
+        (((0, 4), (2, 6), (5, 9)), 2, (3, 3), 0),  # room 1 each, equally wide
+        (((1, 3), (2, 6)), 0, (2, 4), 1),
     ],
 )
-def test_choices_by_hand(windows, present, d, chosen):
-    assert choose_set(windows, present, d) == chosen
+def test_choices_by_hand(windows, present, interval, chosen):
+    assert in_force(windows, present).choose(interval[0], *interval) == chosen
 
 
-def test_a_delay_that_wanders_inside_an_overlap_switches_once():
-    windows, present, chosen = ((1, 3), (2, 6)), 0, []
-    for d in (1, 2, 3, 4, 3, 2, 3, 2, 4, 1, 2, 3):
-        present = choose_set(windows, present, d)
-        chosen.append(present)
-    assert chosen == [0, 0, 0, 1, 1, 1, 1, 1, 1, 0, 0, 0]
+@given(st.lists(st.integers(0, 8), min_size=1, max_size=300), st.sampled_from(SCHEDULES))
+def test_a_delay_that_wanders_comes_back_to_a_narrower_window_at_most_once_in_40_samples(delays, windows):
+    chooser = SetChooser(windows)
+    chosen = [chooser.present, *(chooser.choose(d, d, d) for d in delays)]
+    narrowed = [
+        n
+        for n, (a, b) in enumerate(pairwise(chosen))
+        if a != b and windows[a][0] <= delays[n] <= windows[a][1]  # nothing but the row asked for it
+    ]
+    assert all(later - earlier >= SETTLE_SAMPLES for earlier, later in pairwise([-1, *narrowed]))
+
+
+def test_a_delay_that_wanders_about_an_edge_switches_at_most_once():
+    rng = np.random.default_rng(1)
+    chooser, chosen = SetChooser(((1, 3), (1, 6))), []
+    for _ in range(2000):
+        d = int(rng.integers(2, 6))
+        chosen.append(chooser.choose(d, d, d))
+    assert sum(a != b for a, b in pairwise(chosen)) <= 1
+    assert chosen[-1] == 1
+
+
+def test_one_set_is_chosen_whatever_the_forecast():
+    chooser = SetChooser(((1, 3),))
+    assert {chooser.choose(d, d, d) for d in DELAYS} == {0}
 
 
 @given(st.lists(st.tuples(st.integers(0, 3 * TELL_NS), st.integers(0, 3)), max_size=60))

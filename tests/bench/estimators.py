@@ -28,11 +28,14 @@ from tests.integration.estimation import CASES, TS_NS, Case, Forecasts, fly, sce
 from tests.integration.forecasters import best
 
 SEED = 3
-RECORDED_S = 60.0
+RECORDED_S = 300.0
 TRACKED_S = 30.0
 ROUNDS = 9
 FRAMES = 2000
 LIMIT = 2.0
+"""Against pymavlink's parser, which is what an autopilot in Python would parse with."""
+LIMIT_OURS = 4.0
+"""Against our own, which takes half the time."""
 
 OTHERS = ("link", "", "bias", "spread", "wrong", "from, s", "then", "ours")
 """The last three: since when, how often wrong from then on, and how often we were at the same time."""
@@ -129,10 +132,11 @@ def cost() -> list[tuple[str, float, float, str]]:
                 parse(frame)
             seconds.append((time.perf_counter() - start) / FRAMES)
     rows = []
-    for parser_name, seconds in zip(("ours", "pymavlink"), parses, strict=True):
+    named = (("ours", LIMIT_OURS), ("pymavlink", LIMIT))
+    for (parser_name, limit), seconds in zip(named, parses, strict=True):
         ratio = statistics.median(e / s for e, s in zip(estimator[1:], seconds[1:], strict=True))
         note = f"{statistics.median(estimator) * 1e6:.1f} us, one parse {statistics.median(seconds) * 1e6:.1f} us"
-        rows.append((f"delay estimator per sample / parsing an ATTITUDE, {parser_name}", ratio, LIMIT, note))
+        rows.append((f"delay estimator per sample / parsing an ATTITUDE, {parser_name}", ratio, limit, note))
     what, ratio, limit, note = rows[0]
     rows[0] = what, ratio, limit, f"{note}; us per sample: {by_method(calls, samples)}"
     return rows

@@ -74,6 +74,7 @@ def test_the_best_forecaster_is_the_same_by_convolution_and_by_counting(case: Ca
     rows, d = flight.applied
     ages = flight.ages_ms[rows]
     one, other = by_convolution(case, ages), by_table(case, ages)
+    assert abs(score(one, d).covered - score(one, d).claimed) < 0.01
     assert abs(score(one, d).exact - score(other, d).exact) < 0.003
     assert abs(score(one, d).width - score(other, d).width) < 0.05
     assert float(np.mean(one.d == other.d)) > 0.98
