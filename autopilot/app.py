@@ -47,8 +47,6 @@ TIMESYNC_NS = 100 * NS_PER_MS
 SYNC_WAIT_NS = 2 * NS_PER_S
 """A plant that answers no TIMESYNC gets its heartbeat after this time all the same."""
 COUNTERS_NS = NS_PER_S
-HALF_SAMPLES = 3
-"""One half of the state may be missing for so long before that is said: less than a stale state takes."""
 
 
 class AutopilotNode:
@@ -69,7 +67,9 @@ class AutopilotNode:
         self.clock = ClockSync()
         self.delay = DelayEstimator(self.model.Ts_ns)
         self.samples = SampleAssembler(self.model, config.alpha)
-        self.halves = Halves(self.samples.needed, HALF_SAMPLES * self.model.Ts_ns)
+        # the message of sample n + 1 is the first that misses its half; at n + d_max, just before stale, it is said
+        half_ns = max(1, 2 * config.gains.d_max - 3) * self.model.Ts_ns // 2
+        self.halves = Halves(self.samples.needed, half_ns)
         self.pilot = Pilot(config, self._notice)
         self.gain_set_changes = SetChanges()
         self.telemetry = DelayTelemetry()

@@ -394,11 +394,12 @@ class DelayEstimator:
         if first == last:
             return DelayEstimate(first, first, first, self._certain, self._status)
         last = min(last, first + MAX_SPREAD)
-        opened = law.open_at(age_ns, last)
+        opened = law.open_at(age_ns)
+        known = len(opened) - 1
         weights, total, before, limit_ns = [], 0.0, 0.0, first * Ts_ns - age_ns
         for m in range(first, last + 1):
             level = levels[bisect_right(transits, limit_ns)] if m < last else 1.0
-            weight = (level - before) * opened[m]
+            weight = (level - before) * opened[m if m < known else known]
             weights.append(weight)
             total += weight
             before, limit_ns = level, limit_ns + Ts_ns

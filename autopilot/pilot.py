@@ -263,7 +263,7 @@ class Pilot:
         if not fits:
             self.event(Event.OUTSIDE, f"delay {d} reported", now_ns)
         elif in_window and not self._chosen.covers(j, d):
-            self.event(Event.OUTSIDE, f"delay {d} reported of another gain set", now_ns)
+            self.event(Event.OUTSIDE, f"delay {d} outside its gain set", now_ns)
         return True
 
     def heard_ground(self, now_ns: int) -> None:

@@ -60,6 +60,8 @@ BINS_PER_SAMPLE = 25
 MAX_SLOTS = 64
 """A loop of more samples is forecast without asking who overtakes."""
 
+_ALL_OPEN = [1.0]
+
 MIN_AGREEMENT = 3
 """A shift must explain so many reports more than none."""
 
@@ -105,12 +107,11 @@ class TransitLaw:
     open: list[list[float]]
     density: Floats
 
-    def open_at(self, age_ns: int, last: int) -> list[float]:
-        """Return the open[m] of an age, for m up to ``last`` at least; all are above 0."""
+    def open_at(self, age_ns: int) -> list[float]:
+        """Return the open[m] of an age, all above 0; the last stands for every larger m."""
         if not self.open:
-            return [1.0] * (last + 1)
-        row = self.open[min(max((age_ns - self.first_age_ns) // self.bin_ns, 0), len(self.open) - 1)]
-        return row if last < len(row) else row + row[-1:] * (last + 1 - len(row))
+            return _ALL_OPEN
+        return self.open[min(max((age_ns - self.first_age_ns) // self.bin_ns, 0), len(self.open) - 1)]
 
 
 def transit_law(transits: Ints, ages: Ints, reports: Reports, Ts_ns: int, density: Floats) -> TransitLaw:

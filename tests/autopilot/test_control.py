@@ -207,6 +207,14 @@ def test_a_row_begins_anew_with_every_sample_that_breaks_it():
         assert [chooser.choose(1, 1, 2) for _ in range(40)][-2:] == [1, 0]
 
 
+def test_a_change_to_a_wider_window_ends_the_row_of_the_narrower_one():
+    chooser = in_force(((1, 2), (1, 3), (1, 6)), 1)
+    assert {chooser.choose(1, 1, 2) for _ in range(39)} == {1}
+    assert chooser.choose(5, 5, 5) == 2
+    assert {chooser.choose(1, 1, 2) for _ in range(39)} == {2}
+    assert chooser.choose(1, 1, 2) == 0
+
+
 def test_an_unknown_delay_breaks_no_row_and_makes_none():
     chooser = in_force(((1, 2), (1, 6)), 1)
     for _ in range(39):

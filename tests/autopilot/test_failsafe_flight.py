@@ -148,22 +148,22 @@ def test_the_monitor_flies_the_main_law_whatever_the_link_does(slow_ms):
         assert (c["gain_set"], c["u"][0]) == (0, pytest.approx(eq9(D3, c), abs=1e-12))
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_a_delay_that_jitters_about_the_edge_of_the_window_changes_laws_at_most_once_a_second(seed):
+@pytest.mark.parametrize(("scale_ms", "seed"), [(6.0, 0), (6.0, 1), (7.0, 0), (15.0, 0)])
+def test_a_delay_that_jitters_about_the_edge_of_the_window_gives_the_law_back_at_most_once_a_second(scale_ms, seed):
     rng = np.random.default_rng(seed)
 
     def edge(_now_ns: int) -> int:
-        return 20 * MS + int(rng.gamma(2.0, 15.0) * MS)
+        return 20 * MS + int(rng.gamma(2.0, scale_ms) * MS)
 
-    flight = Flight(AutopilotConfig(D3, STEP), PlantConfig(HIRM.model, X0), TWENTY_MS, edge).fly(40 * S)
-    back = [j for j, law in laws(flight) if law == "TRACKING"]
-    into = [j for j, law in laws(flight) if law == "CONSERVATIVE"]
-    assert into
-    truth = [t["d"] for t in flight.bodies("plant/truth") if t["d"] is not None]
-    assert 0.02 < np.mean(np.array(truth) > D3.d_max) < 0.5
-    for j in back:
-        assert j - max(i for i in into if i < j) >= CALM_SAMPLES
-    assert len(into) + len(back) <= 40
+    flight = Flight(AutopilotConfig(D3, STEP), PlantConfig(HIRM.model, X0), TWENTY_MS, edge).fly(30 * S)
+    truth = np.array([t["d"] for t in flight.bodies("plant/truth") if t["d"] is not None])
+    assert 0.005 < np.mean(truth > D3.d_max) < 0.4
+    changes = laws(flight)
+    assert len(changes) > (4 if scale_ms < 10.0 else 0)
+    assert len(changes) < 30  # less than one a second
+    for law in ("TRACKING", "CONSERVATIVE"):
+        at = [j for j, name in changes if name == law]
+        assert all(later - earlier >= CALM_SAMPLES for earlier, later in pairwise(at))
 
 
 # the other causes, over a link

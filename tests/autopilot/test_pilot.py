@@ -90,12 +90,12 @@ def test_a_half_of_the_state_that_stops_is_hold_and_its_name_is_the_reason(attit
     assert missing in b.texts()
 
 
-def test_where_the_state_is_stale_before_the_half_is_said_the_half_is_said_all_the_same():
+def test_a_missing_half_is_said_just_before_the_state_is_stale_and_is_the_reason_of_hold():
     b = bench(ALONE)
     give(b, 10)
     halves(b, 40, attitude=True)
     assert b.mode == "NEUTRAL"
-    assert b.transitions()[1:] == ["TRACKING to HOLD: no state for 3 samples", "HOLD to NEUTRAL: no recovery"]
+    assert b.transitions()[1:] == ["TRACKING to HOLD: AOA_SSA missing", "HOLD to NEUTRAL: no recovery"]
     assert b.texts().count("AOA_SSA missing") == 1
     assert give(b, 3) == ["NEUTRAL", "NEUTRAL", "TRACKING"]
 
@@ -369,6 +369,15 @@ def test_a_lost_ground_station_eases_the_reference_to_zero_and_it_comes_back_wit
     steps = np.abs(np.diff([c["xr"] for c in b.commands], axis=0)).max(axis=0)
     own = np.abs(np.diff(reference(400), axis=0)).max(axis=0)
     assert (steps <= 3.0 * own).all()  # the look ahead of two samples is given up at once, and no more
+
+
+def test_the_loss_of_a_ground_station_is_told_at_its_very_instant():
+    b = bench(D3, ground_timeout_ns=2 * S)
+    with_station(b, 50)
+    b.node.receive("gcs0", STATION.encode(autopilot_heartbeat(tracking=True, degraded=False)), b.now_ns)
+    heard_ns = b.now_ns
+    give(b, 100, 33 * MS)
+    assert (b.mode, b.node.failsafe.since_ns) == ("LEVEL", heard_ns + 2 * S)
 
 
 def test_a_ground_station_may_be_silent_for_ever_unless_a_timeout_is_asked_for():
