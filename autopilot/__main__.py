@@ -143,12 +143,18 @@ def cli(
     for each, verification in ((gains, proof), (gains.conservative, node.conservative_proof)):
         if require_certificate and each is not None and verification is not None and not verification.passed:
             reason = f"no verified certificate ({verification.reason}), but --require-certificate"
-            raise InputError(f"gains {each.name}: {reason}")
+            which = "gains" if each is gains else "conservative gains"
+            raise InputError(f"{which} {each.name}: {reason}")
     openers = [partial(dial, "plant", plant), *(partial(dial, f"gcs{i}", a) for i, a in enumerate(stations))]
     proved = "certificate verified" if proof.passed else "no verified certificate"
     windows = ", ".join(f"{d_min}..{d_max}" for d_min, d_max in node.windows)
     scheduled = f", delay {windows}" if len(node.windows) > 1 else ""
-    banner = f"autopilot: gains {gains.name} ({proved}){scheduled}, plant {plant[0]}:{plant[1]}"
+    wide, wide_proof, also = gains.conservative, node.conservative_proof, ""
+    if wide is not None and wide_proof is not None:
+        also = (
+            f", conservative {wide.name} ({'certificate verified' if wide_proof.passed else 'no verified certificate'})"
+        )
+    banner = f"autopilot: gains {gains.name} ({proved}){scheduled}{also}, plant {plant[0]}:{plant[1]}"
     metadata = {"program": "autopilot", "gains": gains.name, "version": version()}
     run_node("autopilot", node, openers, ProcessOptions(clock, record, stream), metadata, tap=True, banner=banner)
 

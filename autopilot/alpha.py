@@ -14,17 +14,18 @@ with wings level in still air. Otherwise, for small angles, what it gives is
 
 Noise: :func:`alpha_sigma_rad`. No certificate speaks of any of this: it is proved for the state itself.
 
-Which source is taken is a choice for the flight. ``auto`` takes AOA_SSA; only where none has ever come,
-ALPHA_WAIT_NS after the first ATTITUDE, does it go over to VFR_HUD, and back for good with the first AOA_SSA.
-An AOA_SSA that came and stops has no stand-in: failsafe knows what to do without a state, but nothing would
-tell it of a wrong one.
+Which source is taken is a choice for an epoch of the plant. ``auto`` takes AOA_SSA; only where none comes for
+ALPHA_WAIT_NS, from the first ATTITUDE on, does it go over to VFR_HUD. MIN_ANGLES of AOA_SSA decide: it takes that one,
+or goes back to it, and stays. Fewer decide nothing, as a stray one must not cost the angle of attack for ever. Once
+decided, an AOA_SSA that stops has no stand-in: failsafe knows what to do without a state, but nothing would tell it
+of a wrong one.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Literal
 
@@ -37,6 +38,7 @@ __all__ = [
     "ALPHA_WAIT_NS",
     "HUD_LIMIT_NS",
     "MIN_AIRSPEED_M_S",
+    "MIN_ANGLES",
     "AlphaChoice",
     "AlphaSelector",
     "AlphaSource",
@@ -46,7 +48,10 @@ __all__ = [
 ]
 
 ALPHA_WAIT_NS = 2 * NS_PER_S
-"""How long after the first ATTITUDE ``auto`` waits for AOA_SSA before it takes VFR_HUD."""
+"""How long ``auto`` waits for AOA_SSA, or for the next one, before it takes VFR_HUD."""
+
+MIN_ANGLES = 5
+"""So many AOA_SSA, none of them ALPHA_WAIT_NS after the one before, decide ``auto``: fewer may be stray ones."""
 
 HUD_LIMIT_NS = NS_PER_S // 2
 """A VFR_HUD that came longer ago, own time, says nothing about now."""
@@ -106,30 +111,44 @@ class AlphaSelector:
     source : AlphaSource
         Where it comes from. While ``auto`` waits that is AOA_SSA.
     undecided : bool
-        Whether the source may still change: ``auto`` before the first AOA_SSA.
+        Whether the source may still change: ``auto`` before MIN_ANGLES of AOA_SSA.
     since_ns : int or None
-        Own time of the last change of source; None while there was none.
+        Own time of the last change of source; None while there was none in this epoch.
     """
 
     source: AlphaSource
     undecided: bool = False
     since_ns: int | None = None
+    _auto: bool = field(init=False)
     _attitude_ns: int | None = None
+    _angles: int = 0
+    _angle_ns: int = 0
     _hud: VfrHud | None = None
     _hud_ns: int = 0
 
+    def __post_init__(self) -> None:
+        self._auto = self.undecided
+
     def restart(self) -> None:
-        """Begin a new epoch: forget VFR_HUD and how long there was no AOA_SSA, but not that one has come."""
+        """Begin a new epoch: nothing has come yet, and ``auto`` waits for AOA_SSA again."""
+        if self._auto:
+            self.source, self.undecided, self.since_ns = AlphaSource.AOA_SSA, True, None
         self._hud = None
         self._attitude_ns = None
+        self._angles = 0
 
     def air(self, hud: VfrHud, now_ns: int) -> None:
         """Take a VFR_HUD; the last to come counts as the newest."""
         self._hud, self._hud_ns = hud, now_ns
 
     def angle(self, now_ns: int) -> None:
-        """Note that AOA_SSA has come: ``auto`` is decided for good."""
-        if self.undecided:
+        """Note that AOA_SSA has come: while ``auto`` waits it waits anew, and with MIN_ANGLES it is decided."""
+        if not self.undecided:
+            return
+        self._angles = self._angles + 1 if now_ns - self._angle_ns < ALPHA_WAIT_NS else 1
+        self._angle_ns = now_ns
+        self._attitude_ns = None
+        if self._angles >= MIN_ANGLES:
             self.undecided = False
             self._change(AlphaSource.AOA_SSA, now_ns)
 

@@ -47,6 +47,8 @@ TIMESYNC_NS = 100 * NS_PER_MS
 SYNC_WAIT_NS = 2 * NS_PER_S
 """A plant that answers no TIMESYNC gets its heartbeat after this time all the same."""
 COUNTERS_NS = NS_PER_S
+HALF_NS = NS_PER_S
+"""Half of the state may be missing for so long before that is said."""
 
 
 class AutopilotNode:
@@ -67,10 +69,8 @@ class AutopilotNode:
         self.clock = ClockSync()
         self.delay = DelayEstimator(self.model.Ts_ns)
         self.samples = SampleAssembler(self.model, config.alpha)
-        # the message of sample n + 1 is the first that misses its half; at n + d_max, just before stale, it is said
-        half_ns = max(1, 2 * config.gains.d_max - 3) * self.model.Ts_ns // 2
-        self.halves = Halves(self.samples.needed, half_ns)
-        self.pilot = Pilot(config, self._notice)
+        self.halves = Halves(self.samples.needed)
+        self.pilot = Pilot(config, self._notice, self._missing_half)
         self.gain_set_changes = SetChanges()
         self.telemetry = DelayTelemetry()
         self.epoch = 0
@@ -80,6 +80,7 @@ class AutopilotNode:
         )
         self._steps_seen = 0
         self._alpha_told: AlphaSource | None = None
+        self._half_told: str | None = None
         self._started_ns: int | None = None
         self._next_heartbeat_ns: int | None = None
         self._next_timesync_ns: int | None = None
@@ -133,6 +134,7 @@ class AutopilotNode:
         self._tick_plant_link(now_ns)
         last = self.pilot.last
         if self.pilot.tick(now_ns) and last is not None:
+            self.delay.repeated(last.j)
             self._send_command(last)
         self._tick_telemetry(now_ns)
         mode = self.pilot.mode
@@ -142,6 +144,7 @@ class AutopilotNode:
         if now_ns >= self._next_counters_ns:
             self._next_counters_ns = following(self._next_counters_ns, COUNTERS_NS, now_ns)
             self._record_counters(now_ns)
+            self._tell_missing_half(now_ns)
 
     def next_deadline_ns(self) -> int | None:
         """Return when ``tick`` is wanted: at once (0) for the first time, and to tell of a command just sent."""
@@ -178,21 +181,25 @@ class AutopilotNode:
             return
         peer_ns = self.clock.peer_at_most_ns(now_ns)
         sample = self.samples.add(message, now_ns, peer_ns)
-        if self.samples.jumped_back and self._plant_restarted():
-            self._new_epoch(now_ns)
+        restarted = self.samples.jumped_back and self._plant_restarted()
+        if why := "plant restarted" if restarted else self.samples.lost:
+            self._new_epoch(why, now_ns)
             sample = self.samples.add(message, now_ns, peer_ns)
         if sample is not None:
             self._command(sample, peer_ns is not None, now_ns)
-        if missing := self.halves.came(type(message), now_ns):
-            self._half_missing(missing, now_ns)
+        self.halves.came(type(message), now_ns)
 
-    def _half_missing(self, missing: str, now_ns: int) -> None:
-        """Say that half of the state has stopped coming, unless it need not come."""
-        if self.samples.alpha is AlphaSource.VFR_HUD:
-            return
-        self.vehicle.say(Severity.WARNING, missing)
-        self._event("half", missing, now_ns)
-        self.pilot.event(Event.HALF, missing, now_ns)
+    def _missing_half(self, since_ns: int) -> str | None:
+        """Return which half of the state has not come since a time, unless it need not come."""
+        return None if self.samples.alpha is AlphaSource.VFR_HUD else self.halves.missing(since_ns)
+
+    def _tell_missing_half(self, now_ns: int) -> None:
+        """Say once that half of the state has been missing for long, in whatever mode."""
+        missing = self._missing_half(now_ns - HALF_NS)
+        if missing is not None and missing != self._half_told:
+            self.vehicle.say(Severity.WARNING, missing)
+            self._event("half", missing, now_ns)
+        self._half_told = missing
 
     def _timesync(self, message: Timesync, now_ns: int) -> None:
         if message.tc1 == 0:
@@ -213,11 +220,11 @@ class AutopilotNode:
 
     def _named_value(self, message: NamedValueInt, now_ns: int) -> None:
         if message.name == "SAMPLE_K":
-            stepped, last = self.clock.steps > self._steps_seen, self.pilot.last
-            if stepped and last is not None and message.value <= last.j:
-                self._new_epoch(now_ns)
             peer_ns = self.clock.peer_at_most_ns(now_ns)
             sample = self.samples.number(message.value, message.time_boot_ms, peer_ns)
+            if self.samples.lost:
+                self._new_epoch(self.samples.lost, now_ns)
+                sample = self.samples.number(message.value, message.time_boot_ms, peer_ns)
             if sample is not None:
                 self._command(sample, peer_ns is not None, now_ns)
         elif message.name == "DELAY_K":
@@ -231,14 +238,14 @@ class AutopilotNode:
         """Whether the clock has stepped back since the newest sample: with stamps that jumped back, a restart."""
         return self.clock.steps > self._steps_seen and self.clock.last_step_ns < -JUMP_BACK_NS // 2
 
-    def _new_epoch(self, now_ns: int) -> None:
+    def _new_epoch(self, why: str, now_ns: int) -> None:
         self.epoch += 1
         self._steps_seen = self.clock.steps
         self.samples.restart()
         self.halves.forget()
         self.pilot.restart()
-        self._event("epoch", f"plant restarted, epoch {self.epoch}", now_ns)
-        self.pilot.event(Event.RESTARTED, "plant restarted", now_ns)
+        self._event("epoch", f"{why}, epoch {self.epoch}", now_ns)
+        self.pilot.event(Event.RESTARTED, why, now_ns)
 
     # One command per sample
 

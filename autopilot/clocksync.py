@@ -1,4 +1,4 @@
-"""Clock offset and skew between autopilot and plant from TIMESYNC exchanges, with bounds that do not lie.
+"""Clock offset and skew between autopilot and plant from TIMESYNC exchanges, with bounds that hold for any latency.
 
 One exchange sends ``ts1`` (our clock), the peer answers with ``tc1`` (its clock) somewhere between our sending
 and our receiving, so with offset = peer - own

@@ -168,10 +168,15 @@ class ChosenSets:
     _applied: int = -1
 
     def note(self, j: int, gain_set: int) -> None:
-        """Remember the set of the command of sample j, and no more than the delays of the windows can ask for."""
+        """Remember the set of the command of sample j, and no more than the delays of the windows can ask for.
+
+        Numbers rise, with gaps. After one that falls those above it are forgotten.
+        """
         if len(self.windows) > 1:
             self._sets[j] = gain_set
-            self._sets.pop(j - self.windows[-1][1] - 1, None)
+            limit = j - self.windows[-1][1]
+            while not limit <= (oldest := next(iter(self._sets))) <= j:
+                del self._sets[oldest]
 
     def covers(self, j: int, d: int) -> bool:
         """Return whether the set of a command fits the first delay reported of it, to within one sample."""

@@ -41,7 +41,7 @@ COVERAGE = 0.95
 MAX_TRANSITS = 1024
 """Transits that describe the link: 100 s at 10 Hz."""
 MAX_REPORTS = 4096
-"""First delays that correct it, of two minutes and more: they decide the stated probability."""
+"""First delays that correct it: 100 s at 40 Hz. They decide the stated probability, so they are many."""
 MAX_AGES = 1024
 """Ages that tell who overtakes."""
 MAX_SENT = 256
@@ -64,6 +64,11 @@ RENEW_REPORTS = 640
 RENEW_SHARE = 4
 """While there are few: when the new ones are one in so many."""
 
+STALL_REQUESTS = 5
+"""So many requests in a row that were read together, within"""
+STALL_SHARE = 0.1
+"""this share of the time between their sending, are a stall of the peer."""
+
 CHANGE_TRANSITS = 16
 """Transits in a row that may show a change of the link, among at least as many before."""
 CHANGE_SIGMA = 5.0
@@ -76,13 +81,13 @@ CONTRADICTIONS = 3
 SUSPECT_TRANSITS = MIN_TRANSITS
 """Transits in a row that confirm it, all at one end of those before:"""
 SUSPECT_LEVEL = 0.4
-"""off their middle by so much of at most one half, by chance once in 50,000 suspicions."""
+"""off their middle by so much of at most one half, by chance once in 4,500 suspicions."""
 SHIFT_REPORTS = 256
 """The latest reports, which decide the shift; after a suspicion only those since then."""
 MAX_SPREAD = 1000
 """Delays that a forecast looks at, whatever transits a peer makes us believe in."""
-MAX_TIME_NS = 1 << 60
-"""No clock shows more, 36 years; what does is refused."""
+MAX_TIME_NS = 1 << 61
+"""No clock shows more, 73 years, of the Unix epoch too; what does is refused. Sums of two fit 64 bits with room."""
 SCORES = 1000
 """Forecasts over which their success is averaged."""
 
@@ -128,7 +133,7 @@ class _Window:
     def __init__(self, capacity: int, columns: int) -> None:
         self._capacity = capacity
         self._rows = np.zeros((0, columns), dtype=np.int64)
-        self._new: list[tuple[int, ...]] = []
+        self._new: deque[tuple[int, ...]] = deque(maxlen=capacity)
         self.append = self._new.append
 
     @property
@@ -190,6 +195,7 @@ class DelayEstimator:
         self._reports = _Window(MAX_REPORTS, 3)
         self._sent: dict[int, tuple[int, int, DelayEstimate]] = {}
         self._latched: dict[int, int] = {}
+        self._last_request = (0, 0)
         self._levels: deque[float] = deque(maxlen=CHANGE_TRANSITS)
         self._contradictions = self._in_a_row = 0
         self._suspected = False
@@ -199,7 +205,7 @@ class DelayEstimator:
         self._law: TransitLaw | None = None
         self._line = ClockLine(0, 0, 0.0)
         self._skew = 0.0
-        self._certain = self._enough = 0.0
+        self._certain = 0.0
         self._status = DelayStatus.UNKNOWN
         self._heard_ns = self._transit_ns = 0
 
@@ -214,14 +220,15 @@ class DelayEstimator:
         self._heard_ns = self._transit_ns = now_ns
         self._transits.append((ts1, tc1 - ts1))
         self._see_due()
+        (sent_ns, read_ns), self._last_request = self._last_request, (ts1, tc1)
+        waited = abs(tc1 - read_ns) < STALL_SHARE * (ts1 - sent_ns)  # for a peer that stood still
         law = self._law
-        if law is not None and len(law.transits) >= CHANGE_TRANSITS:
+        if law is not None and not waited and len(law.transits) >= CHANGE_TRANSITS:
             self._see_change(tc1 - ts1 - self._line.at(ts1), law.transits)
 
     def _see_change(self, transit_ns: int, transits: list[int]) -> None:
         """Compare the latest transits with those before; drop these when the link has changed."""
-        if not self._suspected:
-            transit_ns += self.shift_ns
+        transit_ns += self.shift_ns  # as those before are
         known = len(transits)
         lower = bisect_left(transits, transit_ns - CHANGE_TOLERANCE_NS)
         upper = bisect_right(transits, transit_ns + CHANGE_TOLERANCE_NS)
@@ -250,6 +257,10 @@ class DelayEstimator:
         if len(self._sent) > MAX_SENT:
             del self._sent[next(iter(self._sent))]
 
+    def repeated(self, j: int) -> None:
+        """Take note that the command of sample j is sent once more: its first delay would tell nothing any more."""
+        self._sent.pop(j, None)
+
     def report(self, k: int, j: int, now_ns: int) -> None:
         """Take the plant's word that the command of sample j was in force at its sample k."""
         latched = self._latched
@@ -267,9 +278,11 @@ class DelayEstimator:
         sent = self._sent.pop(j, None)
         if sent is None or d < 1:
             return
-        self._heard_ns = now_ns
         left_ns, sample_ns, forecast = sent
-        self._reports.append((left_ns, sample_ns, d))
+        self._heard_ns = now_ns
+        sane = forecast.d is None or abs(forecast.d - d) <= MAX_SPREAD  # else a stamp of another clock
+        if sane:
+            self._reports.append((left_ns, sample_ns, d))
         if self._reports.new >= RENEW_REPORTS:
             self._see_due()
         forecast_d, low, high = forecast[:3]
@@ -281,7 +294,7 @@ class DelayEstimator:
         self.exact += weight * ((forecast_d == d) - self.exact)
         self.covered += weight * (covered - self.covered)
         self._since_suspicion += 1
-        if not covered and self._law is not None and self._contradicts(self._law, sample_ns, left_ns, d):
+        if sane and not covered and self._law is not None and self._contradicts(self._law, sample_ns, left_ns, d):
             self._contradictions += 1
             self._in_a_row += 1
             if self._in_a_row == CONTRADICTIONS and len(self._law.transits) >= CHANGE_TRANSITS:
@@ -322,6 +335,7 @@ class DelayEstimator:
         exchanges = self._transits.rows()
         if self._in_doubt < len(exchanges):
             exchanges = exchanges[: len(exchanges) - self._in_doubt]  # the others may be of another link
+        exchanges = _without_stalls(exchanges)
         transits = exchanges[:, 1] - self._offsets(exchanges[:, 0])
         reports = self._reports.rows()
         ages = reports[:, 0] + self._offsets(reports[:, 0]) - reports[:, 1]
@@ -341,8 +355,7 @@ class DelayEstimator:
         )
         self._density = self._law.density
         n = len(self._law.transits)
-        self._certain = n / (n + 1)
-        self._enough = COVERAGE / self._certain
+        self._certain = (n - 1) / (n + 1)  # the chance that one more lies between the extremes of n: no more is known
         self._status = DelayStatus.ESTIMATED if n >= MANY_TRANSITS else DelayStatus.CONVERGING
 
     def _restart(self, transits: int) -> None:
@@ -390,6 +403,8 @@ class DelayEstimator:
         first = -(-(age_ns + transits[0]) // Ts_ns)
         last = -(-(age_ns + transits[-1]) // Ts_ns)
         if first < 1:
+            if age_ns + transits[-1] < -Ts_ns // 2:
+                return UNKNOWN  # no command arrives before its sample was taken: the stamps are wrong
             first, last = 1, max(1, last)
         if first == last:
             return DelayEstimate(first, first, first, self._certain, self._status)
@@ -409,7 +424,7 @@ class DelayEstimator:
         """Return the likeliest of the delays from ``first`` on, and the interval around it."""
         best = weights.index(max(weights))
         low = high = best
-        covered, enough, last = weights[best], self._enough * total, len(weights) - 1
+        covered, enough, last = weights[best], COVERAGE * total, len(weights) - 1
         while covered < enough and (low > 0 or high < last):
             if high == last or (low > 0 and weights[low - 1] >= weights[high + 1]):
                 low -= 1
@@ -417,8 +432,26 @@ class DelayEstimator:
             else:
                 high += 1
                 covered += weights[high]
-        probability = self._certain * min(1.0, covered / total)
+        probability = min(self._certain, covered / total)
         return DelayEstimate(first + best, first + low, first + high, probability, self._status)
+
+
+def _without_stalls(exchanges: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the exchanges, rows of (sent, transit), without those that only waited for the peer to wake up.
+
+    A peer that stood still reads all requests of that time at once: they say how long it stood, not how long the
+    way is. Of STALL_REQUESTS or more in a row that were read together only the last, which waited least, is kept.
+    """
+    if len(exchanges) <= STALL_REQUESTS:
+        return exchanges
+    sent_ns, read_ns = exchanges[:, 0], exchanges.sum(axis=1)
+    together = np.abs(np.diff(read_ns)) < STALL_SHARE * np.diff(sent_ns)
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], together.view(np.int8), [0]])))
+    keep = np.ones(len(exchanges), dtype=np.bool_)
+    for begin, end in zip(edges[::2], edges[1::2], strict=True):
+        if end - begin + 1 >= STALL_REQUESTS:
+            keep[begin:end] = False
+    return exchanges[keep]
 
 
 def _at_one_end(levels: deque[float]) -> int:

@@ -28,6 +28,7 @@ __all__ = [
     "JUMP_SAMPLES",
     "MAX_RATE_RAD_S",
     "SATURATION_NS",
+    "UNSTICK_SAMPLES",
     "Halves",
     "Plausibility",
     "Saturation",
@@ -45,6 +46,8 @@ FROZEN_SAMPLES = 10
 """After so many samples that only repeat a value it is asked whether the value must have moved."""
 FROZEN_CHANGE = math.radians(0.5)
 """A value must have moved when the model says at least this over FROZEN_SAMPLES, rad or rad/s."""
+UNSTICK_SAMPLES = 200
+"""What stands still is believed again when it need not have moved for so many samples in a row: 5 s at 25 ms."""
 COMMAND_MEMORY = 20
 """The input in force may be any of so many commands before the row: the loop delay is not known here."""
 CALM_SHARE = 0.01
@@ -89,10 +92,15 @@ class Plausibility:
     does, as the pitch angle for a pitch rate; where the wind enters, the model explains too little. So a trimmed
     aircraft in still air may stand still for ever. As the input in force is not known, any between the least and
     the greatest of the last commands will do; before the first commands it is neutral. The sum never reaches
-    further back than the row, so that a small error of the model does not add up in a long steady flight.
+    further back than the row, so that a small error of the model does not add up in a long steady flight. It
+    must miss whichever one sample is left out: a single wrong sample is no reason to call another state frozen.
 
-    A frozen state stays frozen until its value moves. Otherwise it would come back as good with the neutral
-    elevator that failsafe commands, since then nothing has to move any more.
+    A frozen state stays frozen until its value moves, or until the row has fitted the model, with the commands that
+    were sent, at UNSTICK_SAMPLES samples on end. It does not come back at once when the row fits, as with the neutral
+    elevator that failsafe commands nothing has to move any more. It does come back in the end, as an aircraft at rest
+    whose state was called frozen by mistake would otherwise stay at rest, and in neutral, for ever. The price: a
+    sensor that really is frozen is believed again after some time of calm neutral flight, and found again when it
+    must move, up to FROZEN_SAMPLES and the memory of commands later.
 
     A state that may as well be at rest is not told from a frozen one, so this finds a frozen sensor late in calm
     flight: a pitch angle when the pitch rate moves, all states together when the elevator is commanded away from
@@ -125,6 +133,7 @@ class Plausibility:
         self._row: deque[tuple[int, Sequence[float]]] = deque(maxlen=FROZEN_SAMPLES)
         self._same = [0] * model.nx
         self._stuck: list[str | None] = [None] * model.nx
+        self._fitted = [0] * model.nx
         self._plausible: tuple[int, Sequence[float]] | None = None
         self.forget()
 
@@ -134,6 +143,7 @@ class Plausibility:
         self._row.clear()
         self._same = [0] * len(self._same)
         self._stuck = [None] * len(self._stuck)
+        self._fitted = [0] * len(self._fitted)
         self._plausible = None
 
     def commanded(self, u: float) -> None:
@@ -194,29 +204,42 @@ class Plausibility:
         return None if stuck is None else Verdict(Event.FROZEN, stuck)
 
     def _find_stuck(self, j: int, x: Sequence[float]) -> None:
-        """Note each state that has stood still over a row that does not fit the model."""
-        missed = self._missed(j, x)
-        for n, same in enumerate(self._same):
-            if same < FROZEN_SAMPLES or self._stuck[n] is not None:
-                continue
+        """Note each state that has stood still over a row that does not fit the model; clear one when it long did."""
+        still = [n for n, same in enumerate(self._same) if same >= FROZEN_SAMPLES]
+        row = [*self._row, (j, x)]
+        missed = self._missed(row)
+        if any(missed[i] > FROZEN_CHANGE for n in still for i in self._moved[n]):
+            missed = self._missed_by_all(row)
+        for n in still:
             i = max(self._moved[n], key=missed.__getitem__)
-            if missed[i] > FROZEN_CHANGE:
+            if missed[i] <= FROZEN_CHANGE:
+                self._fitted[n] += 1
+                if self._fitted[n] >= UNSTICK_SAMPLES:
+                    self._stuck[n] = None
+                continue
+            self._fitted[n] = 0
+            if self._stuck[n] is None:
                 off = f"{self._names[i]} off by {missed[i]:.2g} > {FROZEN_CHANGE:.2g}"
                 self._stuck[n] = f"{self._names[n]} frozen at {x[n]:.3g}, {off}"
 
-    def _missed(self, j: int, x: Sequence[float]) -> list[float]:
-        """Return by how much each state's change over the row misses the model's, at the least, per FROZEN_SAMPLES.
+    def _missed_by_all(self, row: Sequence[tuple[int, Sequence[float]]]) -> list[float]:
+        """Return by how much each state misses the model's change at the least, with any one sample left out."""
+        without = (self._missed([*row[:k], *row[k + 1 :]]) for k in range(len(row)))
+        return [min(each) for each in zip(*without, strict=True)]
+
+    def _missed(self, row: Sequence[tuple[int, Sequence[float]]]) -> list[float]:
+        """Return by how much each state's change over a row misses the model's, at the least, per FROZEN_SAMPLES.
 
         Over lost samples the one before stands for them.
         """
-        numbers, states = zip(*self._row, strict=True)
-        spans = [after - before for before, after in pairwise((*numbers, j))]
-        steps = j - numbers[0]
-        columns = zip(*states, strict=True)
+        numbers, states = zip(*row, strict=True)
+        spans = [after - before for before, after in pairwise(numbers)]
+        steps = numbers[-1] - numbers[0]
+        columns = zip(*states[:-1], strict=True)
         dx = [sum(map(mul, spans, values)) - steps * trim for values, trim in zip(columns, self._trim, strict=True)]
         low, high = steps * (min(self._u) - self._neutral), steps * (max(self._u) - self._neutral)
         missed = []
-        for A, B, before, now in zip(self._A, self._B, states[0], x, strict=True):
+        for A, B, before, now in zip(self._A, self._B, states[0], states[-1], strict=True):
             rest = sum(map(mul, A, dx)) - (now - before)
             one, other = rest + B * low, rest + B * high
             least = 0.0 if one * other <= 0.0 else min(abs(one), abs(other))
@@ -304,51 +327,28 @@ class Silence:
 
 
 class Halves:
-    """Tells which half of the state has stopped coming while the other comes.
-
-    A half is missed from the first message of another half on that follows its own last one. When nothing at all
-    has come for the limit, the link was gone, not one half, and the time begins anew.
+    """Tells which half of the state does not come any more while another does.
 
     Parameters
     ----------
     needed : iterable of type
         The messages that carry a state; with one there are no halves.
-    limit_ns : int
-        For how long a half may be missed, ns; some samples, as a packet may be lost or late.
-
-    Attributes
-    ----------
-    missing : set of type
-        What is missing now.
     """
 
-    def __init__(self, needed: Iterable[type[Measurement]], limit_ns: int) -> None:
-        self.limit_ns = limit_ns
-        self.missing: set[type[Measurement]] = set()
-        self._missed_ns: dict[type[Measurement], int | None] = dict.fromkeys(needed)
-        self._last_ns: int | None = None
+    def __init__(self, needed: Iterable[type[Measurement]]) -> None:
+        self._came_ns: dict[type[Measurement], int | None] = dict.fromkeys(needed)
 
     def forget(self) -> None:
         """Begin anew, as after a restart of the plant."""
-        self.missing.clear()
-        self._missed_ns = dict.fromkeys(self._missed_ns)
-        self._last_ns = None
+        self._came_ns = dict.fromkeys(self._came_ns)
 
-    def came(self, message: type[Measurement], now_ns: int) -> str | None:
-        """Take the type of a measurement; return what has just begun to be missing, in words, or None."""
-        assert message in self._missed_ns, message
-        if self._last_ns is not None and now_ns - self._last_ns > self.limit_ns:
-            self._missed_ns = dict.fromkeys(self._missed_ns)
-        self._last_ns = now_ns
-        self.missing.discard(message)
-        self._missed_ns[message] = None
-        said = None
-        for other, missed_ns in self._missed_ns.items():
-            if other is message:
-                continue
-            if missed_ns is None:
-                self._missed_ns[other] = now_ns
-            elif now_ns - missed_ns > self.limit_ns and other not in self.missing:
-                self.missing.add(other)
-                said = f"{_NAMES[other]} missing"
-        return said
+    def came(self, message: type[Measurement], now_ns: int) -> None:
+        """Take the type of a measurement."""
+        self._came_ns[message] = now_ns
+
+    def missing(self, since_ns: int) -> str | None:
+        """Return what has not come since a time although another half has, in words; None when there is no such."""
+        came = {kind for kind, at_ns in self._came_ns.items() if at_ns is not None and at_ns > since_ns}
+        if not came:
+            return None
+        return next((f"{_NAMES[kind]} missing" for kind in self._came_ns if kind not in came), None)

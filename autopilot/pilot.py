@@ -18,6 +18,7 @@ from autopilot.config import AutopilotConfig
 from autopilot.control import ChosenSets, Law, SetChooser, law_of
 from autopilot.delay import DelayEstimate
 from autopilot.failsafe import FLOWN_BY_LAW, Event, FailsafeState, Limits, Mode, step
+from autopilot.link.clock import NS_PER_S
 from autopilot.link.wire import Severity
 from autopilot.monitors import COMMAND_MEMORY, Plausibility, Saturation, Silence
 from autopilot.reference import Profile, ReferenceModel, match_reference
@@ -27,7 +28,9 @@ from gains.model import GainLaw, Gains, sets_of
 __all__ = ["Command", "Notice", "Pilot"]
 
 MAX_AHEAD = 200
-"""Samples that the reference is looked ahead at the most, whatever delay a peer makes us believe in."""
+"""Samples beyond the windows that the reference is looked ahead, whatever delay a peer makes us believe in."""
+REPORT_NS = NS_PER_S
+"""A delay that was reported longer ago says nothing about now."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -82,6 +85,8 @@ class Pilot:
         What flies.
     tell : callable
         Takes a Notice of each change of mode.
+    missing : callable
+        Says which half of the state has not come since a time (:meth:`autopilot.monitors.Halves.missing`).
 
     Raises
     ------
@@ -89,7 +94,9 @@ class Pilot:
         When the model cannot be flown over MAVLink (sensors, actuator).
     """
 
-    def __init__(self, config: AutopilotConfig, tell: Callable[[Notice], None]) -> None:
+    def __init__(
+        self, config: AutopilotConfig, tell: Callable[[Notice], None], missing: Callable[[int], str | None]
+    ) -> None:
         gains = config.gains
         self.config = config
         self.model = gains.model
@@ -100,6 +107,7 @@ class Pilot:
         self.limits = Limits(config.hold_ns, conservative=self.conservative is not None)
         self.ground = Silence(config.ground_timeout_ns)
         self._tell = tell
+        self._missing = missing
         self._Ts_ns = self.model.Ts_ns
         self._laws = [law_of(each) for each in self.sets]
         self._conservative_law = law_of(self.conservative) if self.conservative is not None else None
@@ -120,7 +128,7 @@ class Pilot:
         self._first_j: int | None = None
         self._fresh_ns: int | None = None
         self._next_repeat_ns: int | None = None
-        self._reported: int | None = None
+        self._reported: tuple[int, int] | None = None
         self._clock_known = False
         self._eased = False
 
@@ -158,7 +166,7 @@ class Pilot:
         self._fresh_ns, self._last, self._clock_known = now_ns, sample, clock_known
         if self._first_j is None:
             self._first_j = sample.j
-        event, reason = self._worth(sample, forecast)
+        event, reason = self._worth(sample, forecast, now_ns)
         self.event(event, reason, now_ns)
         chosen = self.chooser.choose(forecast.d, forecast.low, forecast.high)
         law, gains, gain_set = self._in_force(chosen)
@@ -171,7 +179,8 @@ class Pilot:
 
     def sent(self, command: Command) -> None:
         """Take note of a command that has left; what follows from it alone could wait until now."""
-        self._chosen.note(command.sample.j, self.chooser.present)
+        if command.mode in (Mode.TRACKING, Mode.LEVEL):
+            self._chosen.note(command.sample.j, command.gain_set)
         self._plausibility.commanded(command.u)
         self._next_repeat_ns = command.at_ns + self._Ts_ns
         if event := self._saturation.told(command.saturated, command.at_ns):
@@ -180,7 +189,7 @@ class Pilot:
             widest = self.config.gains if self.conservative is None else self.conservative
             self.reference.ahead(widest.d_max + 1)
 
-    def _worth(self, sample: Sample, forecast: DelayEstimate) -> tuple[Event, str]:
+    def _worth(self, sample: Sample, forecast: DelayEstimate, now_ns: int) -> tuple[Event, str]:
         """Return what a sample is to failsafe, and why."""
         verdict = self._plausibility.judge(sample.j, sample.x)
         if verdict is not None:
@@ -189,7 +198,9 @@ class Pilot:
             return Event.OUTSIDE, "delay unknown"
         law, wide = self.config.gains, self.conservative
         # before the narrower law is believed in again, the plant's own word counts as much as the forecast
-        delays = (forecast.d,) if wide is None or self._reported is None else (forecast.d, self._reported)
+        delays = [forecast.d]
+        if wide is not None and self._reported is not None and now_ns - self._reported[1] <= REPORT_NS:
+            delays.append(self._reported[0])
         inside = all(_holds(law, d) for d in delays)
         if inside and self._clock_known:
             return Event.GOOD, f"delay {forecast.d}"
@@ -214,12 +225,14 @@ class Pilot:
         if reference is None:
             return ()
         reference.advance(sample.j)
-        if self._eased is not self.failsafe.ground_lost:
-            self._eased = self.failsafe.ground_lost
+        eased = self.failsafe.ground_lost and self.config.failsafe == "on"
+        if self._eased is not eased:
+            self._eased = eased
             reference.follow(Profile() if self._eased else self.config.profile)
         ahead = 0
         if self.config.align:
-            ahead = min(forecast.d, MAX_AHEAD) if forecast.d is not None else self.config.gains.d_min
+            unknown, most = self.config.gains.d_min, self.config.gains.d_max + MAX_AHEAD
+            ahead = min(forecast.d, most) if forecast.d is not None else unknown
         if self.config.failsafe == "on" and _enters(was, self.mode):
             self._match_reference(reference, sample, gains, ahead)
         return reference.ahead(ahead)
@@ -253,9 +266,9 @@ class Pilot:
 
     def reported(self, j: int, d: int, now_ns: int) -> bool:
         """Take the delay of the command of sample j as the plant reports it; return whether it is one of ours."""
-        if self._first_j is None or j < self._first_j:
-            return False  # the command of an autopilot before this one, or of another epoch
-        self._reported = d
+        if self._first_j is None or self._last is None or not self._first_j <= j <= self._last.j or d < 1:
+            return False  # the command of an autopilot before this one, or of another epoch, or of none
+        self._reported = (d, now_ns)
         in_window = _holds(self.config.gains, d)
         fits = in_window
         if self.conservative is not None and self.mode not in (Mode.TRACKING, Mode.LEVEL):
@@ -273,13 +286,15 @@ class Pilot:
 
     def tick(self, now_ns: int) -> bool:
         """Raise what is due by time alone; return whether neutral is to be sent again, as no sample comes."""
-        if event := self.ground.tick(now_ns):
-            self.event(event, "ground station lost", now_ns)
+        if lost := self.ground.tick(now_ns):
+            self.event(lost, "ground station lost", now_ns)
         due_ns = self._mode_ends_ns()
         if due_ns is None or now_ns < due_ns:
             return False
-        if self.mode in FLOWN_BY_LAW:
-            self.event(Event.STALE, f"no state for {self._patience} samples", now_ns)
+        if self.mode in FLOWN_BY_LAW and self._fresh_ns is not None:
+            missing = self._missing(self._fresh_ns)
+            event = Event.HALF if missing else Event.STALE
+            self.event(event, missing or f"no state for {self._patience} samples", now_ns)
         elif self.mode is Mode.HOLD:
             self.event(Event.EXPIRED, "no recovery", now_ns)
         if self.mode is not Mode.NEUTRAL or self._last is None or self.config.failsafe != "on":

@@ -12,6 +12,10 @@ can be to the plant's time, or to the newest stamp while that is not known, and 
 The plant numbers its samples: NAMED_VALUE_INT ``SAMPLE_K`` gives k at a stamp. Samples wait for the
 first number, so that j means the same sample on both ends although the first ones may be lost; a plant
 that sends none is numbered from the first sample seen.
+
+Nothing that one message says lasts. A number that contradicts the running one is set aside, and believed when
+the next one agrees with it. Where samples are refused as too old for a while although their stamps rise as time
+does, or their numbers have fallen back, the track is lost: ``lost`` says why, and the plant begins a new epoch.
 """
 
 from __future__ import annotations
@@ -29,7 +33,7 @@ from gains.model import Model
 __all__ = ["JUMP_BACK_NS", "Drop", "Sample", "SampleAssembler"]
 
 MAX_PENDING = 16
-"""Incomplete samples that wait for their other half; the oldest is dropped first."""
+"""Incomplete samples that wait for their other half; the first to come is dropped first."""
 
 NUMBER_WAIT_NS = 5 * NS_PER_S // 2
 """How long samples wait for the plant's SAMPLE_K, sent every second, before they are numbered from the first seen."""
@@ -39,6 +43,21 @@ JUMP_BACK_NS = NS_PER_S
 
 FUTURE_SLACK_NS = NS_PER_S
 """A stamp may be later than the plant's time by this much, beyond the bound of the clock estimate."""
+
+RESYNC_NS = NS_PER_S
+"""When all that came for so long, own time, was too old, the newest stamp is taken for the wrong one."""
+
+RESYNC_MEASUREMENTS = 20
+"""So many of one message must have come by then,"""
+
+RESYNC_GAP_NS = 2 * NS_PER_S
+"""none of them later than this after the one before."""
+
+RESYNC_SPREAD_NS = NS_PER_S // 2
+"""The stamps of such measurements rise with own time, up to this much: they are the plant's, and no old ones."""
+
+MAX_STAMP_NS = 1 << 61
+"""73 years: no clock shows more."""
 
 U32 = 1 << 32
 TURN_NS = U32 * NS_PER_MS
@@ -53,6 +72,8 @@ class Drop(StrEnum):
     JUMPED_BACK = "jumped_back"
     FROM_THE_FUTURE = "from_the_future"
     HALF = "half"
+    UNUSED = "unused"
+    """An AOA_SSA while the angle of attack comes from VFR_HUD: too few have come to be trusted."""
     NO_AIR = "no_air"
     """No VFR_HUD to take the angle of attack from: none has come of late, or it is too slow."""
 
@@ -90,6 +111,17 @@ class _Pending:
     parts: dict[type[Measurement], Measurement]
 
 
+@dataclass(slots=True)
+class _Refused:
+    """Messages of one kind, in a row, that were too old: own times of the first and the last, offset, how many."""
+
+    since_ns: int
+    last_ns: int
+    offset_ns: int
+    """Stamp minus own time of the first."""
+    count: int = 0
+
+
 def _nearest(value: int, near: int, modulus: int) -> int:
     """Return the number congruent to ``value`` nearest to ``near``, but none below 0: no clock was there."""
     nearest = unwrap(value, near, modulus)
@@ -116,6 +148,9 @@ class SampleAssembler:
         The messages that carry a state: those that :meth:`add` takes.
     jumped_back : bool
         Whether the last stamp was older than the newest sample by more than JUMP_BACK_NS.
+    lost : str
+        Why stamps or numbers do not go on from where they were, as the last message showed; empty while they do.
+        The caller then begins a new epoch, and gives that message again.
 
     Raises
     ------
@@ -127,7 +162,10 @@ class SampleAssembler:
         self.drops: Counter[Drop] = Counter()
         self.newest_ns: int | None = None
         self.jumped_back = False
+        self.lost = ""
         self._Ts_ns = model.Ts_ns
+        self._slip = JUMP_BACK_NS // self._Ts_ns
+        """So many samples numbers may fall back: they are late, until numbers have caught up."""
         self._sensors = sensors_of(model)
         self._alpha = alpha_selector(self._sensors, alpha, model.name)
         self.needed = frozenset(sensor.message for sensor in self._sensors)
@@ -135,6 +173,11 @@ class SampleAssembler:
             self.needed -= {AoaSsa}
         self._pending: list[_Pending] = []
         self._number: tuple[int, int] | None = None
+        self._doubted: tuple[int, int] | None = None
+        """The plant's last number, which contradicted the running one."""
+        self._last_j: int | None = None
+        """The highest number given in the epoch."""
+        self._refused: dict[type[Measurement], _Refused] = {}
         self._waiting: Sample | None = None
         """The newest complete sample, whose number is not known yet."""
         self._first: tuple[int, int] | None = None
@@ -161,9 +204,12 @@ class SampleAssembler:
     def restart(self) -> None:
         """Begin a new epoch: forget stamps and numbers, keep the counters."""
         self.jumped_back = False
+        self.lost = ""
         self.newest_ns = None
         self._pending.clear()
-        self._number = None
+        self._number = self._doubted = None
+        self._last_j = None
+        self._refused.clear()
         self._waiting = None
         self._first = None
         self._seen_ns = None
@@ -172,7 +218,7 @@ class SampleAssembler:
 
     def forget_number(self) -> None:
         """Wait for the plant's next number: its clock has stepped, and stamps do not count samples across that."""
-        self._number = None
+        self._number = self._doubted = None
         self._first = None
 
     def add(self, message: Measurement, now_ns: int, peer_ns: int | None = None) -> Sample | None:
@@ -188,10 +234,11 @@ class SampleAssembler:
             The plant's time now, at the most; a stamp well after it is refused.
         """
         assert type(message) in self.needed, type(message)
+        self.lost = ""
         if peer_ns is not None and not self._settled:
             self._settle(peer_ns)
         t_ns = self._stamp_ns(message, peer_ns)
-        if peer_ns is not None and t_ns > peer_ns + FUTURE_SLACK_NS:
+        if t_ns >= MAX_STAMP_NS or (peer_ns is not None and t_ns > peer_ns + FUTURE_SLACK_NS):
             self.drops[Drop.FROM_THE_FUTURE] += 1
             return None
         self._note(message, t_ns, now_ns)
@@ -202,9 +249,14 @@ class SampleAssembler:
                 late = t_ns < self.newest_ns - half_ns
                 kind = Drop.JUMPED_BACK if self.jumped_back else Drop.LATE if late else Drop.DUPLICATE
                 self.drops[kind] += 1
+                if kind is not Drop.DUPLICATE:
+                    self._refuse(type(message), t_ns, now_ns)
                 return None
         alpha_rad = None
-        if self._alpha.source is AlphaSource.VFR_HUD and isinstance(message, Attitude):
+        if self._alpha.source is AlphaSource.VFR_HUD:
+            if isinstance(message, AoaSsa):
+                self.drops[Drop.UNUSED] += 1
+                return None
             alpha_rad = self._alpha.alpha_rad(message.pitch, now_ns)
             if alpha_rad is None:
                 self.drops[Drop.NO_AIR] += 1
@@ -218,10 +270,16 @@ class SampleAssembler:
 
     def number(self, k: int, time_boot_ms: int, peer_ns: int | None = None) -> Sample | None:
         """Take the plant's number k of the sample stamped ``time_boot_ms``; return a sample that waited for it."""
+        self.lost = ""
         if peer_ns is not None and not self._settled:
             self._settle(peer_ns)
-        self._seen_ns = at_ns = self._unwrap_ms(time_boot_ms, peer_ns)
-        self._number = (k, at_ns)
+        at_ns = self._unwrap_ms(time_boot_ms, peer_ns)
+        if k < 0 or at_ns >= MAX_STAMP_NS or not self._believed(k, at_ns):
+            return None
+        self._seen_ns = at_ns
+        if self._fell_back(k, at_ns):
+            return None
+        self._number, self._doubted = (k, at_ns), None
         waiting, self._waiting = self._waiting, None
         return self._counted(waiting) if waiting is not None else None
 
@@ -229,8 +287,40 @@ class SampleAssembler:
         """Return the sample j of the command that a reported delay d speaks of; None before samples are numbered."""
         if self._number is None:
             return None
-        k, at_ns = self._number
-        return k + round((self._unwrap_ms(time_boot_ms, None) - at_ns) / self._Ts_ns) - d
+        return self._count(self._number, self._unwrap_ms(time_boot_ms, None)) - d
+
+    # The way back
+
+    def _refuse(self, kind: type[Measurement], t_ns: int, now_ns: int) -> None:
+        """Note that a measurement was too old; in a long row whose stamps rise as time does, the track is lost."""
+        row, offset_ns = self._refused.get(kind), t_ns - now_ns
+        if row is None or now_ns - row.last_ns > RESYNC_GAP_NS or abs(offset_ns - row.offset_ns) > RESYNC_SPREAD_NS:
+            self._refused[kind] = row = _Refused(now_ns, now_ns, offset_ns)
+        row.last_ns = now_ns
+        row.count += 1
+        if row.count >= RESYNC_MEASUREMENTS and now_ns - row.since_ns >= RESYNC_NS:
+            self.lost = "stamps fell back"
+
+    def _believed(self, k: int, at_ns: int) -> bool:
+        """Whether a number of the plant agrees with the running one, or with the one set aside; or set it aside."""
+        if self._number is None or self._count(self._number, at_ns) == k:
+            return True
+        doubted = self._doubted
+        if doubted is None or self._count(doubted, at_ns) != k:
+            self._doubted = (k, at_ns)
+            return False
+        return doubted[0] != k  # a copy of that message confirms nothing
+
+    def _fell_back(self, k: int, at_ns: int) -> bool:
+        """Whether the track is lost with this number: samples would get numbers well below those given."""
+        if self._last_j is None or self.newest_ns is None:
+            return False
+        if self._number is None:  # the clock has stepped: stamps from before it count nothing
+            if k <= self._last_j:
+                self.lost = "plant restarted"
+        elif max(k, self._count((k, at_ns), self.newest_ns)) < self._last_j - self._slip:
+            self.lost = "sample numbers fell back"
+        return bool(self.lost)
 
     # Stamps
 
@@ -278,6 +368,8 @@ class SampleAssembler:
             self.newest_ns = _nearest(self.newest_ns, near_ns, TURN_NS)
         if self._number is not None:
             self._number = (self._number[0], _nearest(self._number[1], near_ns, TURN_NS))
+        if self._doubted is not None:
+            self._doubted = (self._doubted[0], _nearest(self._doubted[1], near_ns, TURN_NS))
         if self._first is not None:
             self._first = (self._first[0], _nearest(self._first[1], near_ns, TURN_NS))
         if self._waiting is not None:
@@ -300,8 +392,7 @@ class SampleAssembler:
             pending = _Pending(t_ns, {type(message): message})
             self._pending.append(pending)
             if len(self._pending) > MAX_PENDING:
-                oldest = min(self._pending, key=lambda p: p.t_ns)
-                self._pending.remove(oldest)
+                oldest = self._pending.pop(0)
                 self.drops[Drop.HALF] += len(oldest.parts)
         if len(pending.parts) < (1 if self._alpha.source is AlphaSource.VFR_HUD else len(self.needed)):
             return None
@@ -325,6 +416,7 @@ class SampleAssembler:
     def _numbered(self, whole: Sample, now_ns: int) -> Sample | None:
         """Return a complete sample with its number, or keep it until there is one."""
         self.newest_ns = whole.t_ns
+        self._refused.clear()
         if self._number is None:
             if self._first is None:
                 self._first = (now_ns, whole.t_ns)
@@ -332,12 +424,20 @@ class SampleAssembler:
             if now_ns - since_ns < NUMBER_WAIT_NS:
                 self._waiting = whole
                 return None
-            self._number = (0, first_ns)
+            self._number = (0 if self._last_j is None else self._last_j + 1, first_ns)
         return self._counted(whole)
 
-    def _counted(self, whole: Sample) -> Sample:
-        """Return the sample with its number; stamps are good to a millisecond."""
+    def _counted(self, whole: Sample) -> Sample | None:
+        """Return the sample with its number; None when the track is lost, as that is well below one given before."""
         assert self._number is not None
-        k, at_ns = self._number
-        j = k + round((whole.t_ns - at_ns) / self._Ts_ns)
-        return Sample(j, whole.t_ns, whole.x, whole.parts, whole.alpha)
+        j = self._count(self._number, whole.t_ns)
+        if self._last_j is not None and j < self._last_j - self._slip:
+            self.lost = "sample numbers fell back"
+            return None
+        self._last_j = j if self._last_j is None else max(j, self._last_j)
+        return replace(whole, j=j)
+
+    def _count(self, number: tuple[int, int], t_ns: int) -> int:
+        """Return the number at a stamp, which is good to a millisecond."""
+        k, at_ns = number
+        return k + round((t_ns - at_ns) / self._Ts_ns)

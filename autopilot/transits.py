@@ -53,11 +53,11 @@ MAX_NEWER = 4
 """Newer commands that are looked at: the fifth would have to gain five samples."""
 LEAST_OPEN = 1e-6
 """What is applied against all odds has a probability all the same."""
-MAX_BINS = 256
+MAX_BINS = 64
 """Bins of the ages."""
 BINS_PER_SAMPLE = 25
 """Bins of the ages per sampling period, where MAX_BINS allows it."""
-MAX_SLOTS = 64
+MAX_SLOTS = 48
 """A loop of more samples is forecast without asking who overtakes."""
 
 _ALL_OPEN = [1.0]

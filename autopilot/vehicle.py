@@ -163,6 +163,6 @@ def banner(gains: GainLaw, proof: Verification, conservative: Verification | Non
     wide = gains.conservative
     if wide is not None and conservative is not None:
         severity = Severity.INFO if conservative.passed else Severity.WARNING
-        unproved = "" if conservative.passed else ", no certificate"
-        texts.append(StatusText(severity, f"conservative {wide.name}: delay {wide.d_min} to {wide.d_max}{unproved}"))
+        unproved = "" if conservative.passed else "unproved "
+        texts.append(StatusText(severity, f"{unproved}conservative {wide.name}: delay {wide.d_min}..{wide.d_max}"))
     return texts

@@ -9,6 +9,7 @@ powers of two, which rounds nothing and makes margin and bound independent of un
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 
 import numpy as np
 
@@ -21,6 +22,7 @@ from gains.verify_switched import check_switched
 __all__ = ["Verification", "check", "least_eta", "verified"]
 
 
+@lru_cache(maxsize=16)  # gains never change, and a schedule may take many seconds
 def verified(gains: GainLaw) -> Verification:
     """Return whether the certificate in a gain file proves its whole window of delays.
 

@@ -74,6 +74,7 @@ def summarise(scenario: Scenario, kept: Sequence[Kept], flight: FlightData, *, v
         "seed": scenario.seed,
         "virtual": virtual,
         "certificate": _certificate(scenario.gains),
+        "conservative": _conservative(scenario.gains),
         "duration_s": len(flight.time_s) * scenario.plant.Ts,
         "samples": len(flight.time_s),
         "diverged": any(topic == "events" and body["kind"] == "diverged" for topic, _, body in kept),
@@ -87,7 +88,7 @@ def summarise(scenario: Scenario, kept: Sequence[Kept], flight: FlightData, *, v
         "failsafe_reaction_samples": failsafe_reaction_samples(kept, scenario),
         "failsafe_transitions": [t["text"] for t in transitions],
         "mode_at_end": flight.modes[-1].mode if flight.modes else Mode.STANDBY.value,
-        "mode_s": {mode.value: sum(m.end_s - m.start_s for m in flight.modes if m.mode == mode) for mode in Mode},
+        "mode_s": _mode_s(flight),
         "longest_saturation_s": _longest(_at_limit(flight)) * scenario.plant.Ts,
         "reentry_saturation_s": _reentry_saturation_s(flight),
         "late_ticks": int(np.count_nonzero(flight.late_ns > LATE_NS)),
@@ -96,6 +97,13 @@ def summarise(scenario: Scenario, kept: Sequence[Kept], flight: FlightData, *, v
         gated = sum(topic == "link/down" and body["fate"] == Fate.GATED for topic, _, body in kept)
         summary["witness"] = {**witness_summary(scenario.witness, flight, _at_limit(flight)), "gated": gated}
     return summary
+
+
+def _mode_s(flight: FlightData) -> dict[str, float]:
+    """Return for how long each mode had the elevator, s; before the first command nobody has."""
+    seconds = {mode.value: sum(m.end_s - m.start_s for m in flight.modes if m.mode == mode) for mode in Mode}
+    rest = len(flight.time_s) * flight.model.Ts - sum(seconds.values())
+    return {**seconds, Mode.STANDBY.value: seconds[Mode.STANDBY.value] + max(0.0, rest)}
 
 
 def _certificate(gains: GainLaw) -> str:
@@ -108,6 +116,14 @@ def _certificate(gains: GainLaw) -> str:
     delta = gains.certificate.get("delta_max")
     robust = f", every |Delta| <= {delta:g}" if isinstance(delta, float) and delta > 0.0 else ""
     return f"verified for d = {gains.d_min}..{gains.d_max}{gain}{robust}"
+
+
+def _conservative(gains: GainLaw) -> dict[str, Any] | None:
+    """Return what the conservative gains are, and what is proved of them; None without."""
+    wide = gains.conservative
+    if wide is None:
+        return None
+    return {"gains": wide.name, "d_min": wide.d_min, "d_max": wide.d_max, "certificate": _certificate(wide)}
 
 
 def delay_summary(flight: FlightData) -> dict[str, Any]:
@@ -241,6 +257,9 @@ def summary_table(summary: Mapping[str, Any], verdicts: Sequence[Verdict]) -> Gr
     delay = summary["delay"]
     grid.add_row("flight", f"{summary['samples']} samples, {summary['duration_s']:g} s, seed {summary['seed']}")
     grid.add_row("gains", f"{summary['gains']} on {summary['plant']} (certificate: {summary['certificate']})")
+    if summary["conservative"] is not None:
+        wide = summary["conservative"]
+        grid.add_row("conservative gains", f"{wide['gains']} (certificate: {wide['certificate']})")
     rms, peak, final = (np.degrees(summary[f"{m}_error_rad"]) for m in ("rms", "max", "final"))
     grid.add_row("tracking error", f"rms {rms:.3g}°, largest {peak:.3g}°, last second {final:.3g}°")
     grid.add_row("true delay", _histogram_text(delay["true_histogram"]))

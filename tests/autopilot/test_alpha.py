@@ -14,6 +14,7 @@ from autopilot.alpha import (
     ALPHA_WAIT_NS,
     HUD_LIMIT_NS,
     MIN_AIRSPEED_M_S,
+    MIN_ANGLES,
     AlphaSource,
     alpha_sigma_rad,
     gamma_rad,
@@ -135,24 +136,67 @@ def test_silence_of_the_link_is_not_silence_of_aoa_ssa() -> None:
     assert b.sources == dict.fromkeys(range(2 * WAIT, 2 * WAIT + 51), "aoa_ssa")
 
 
-def test_auto_goes_back_with_the_first_aoa_ssa_and_stays() -> None:
+def test_auto_goes_back_with_the_fifth_aoa_ssa_and_stays() -> None:
     b = Bench()
     b.fly(0, 100)
     b.fly(101, 120, aoa=True)
     b.fly(121, 121 + 3 * WAIT)
-    # ATTITUDE of sample 101 had made its sample when AOA_SSA came
-    assert [j for j, source in b.sources.items() if source == "vfr_hud"] == list(range(WAIT, 102))
-    assert [j for j, source in b.sources.items() if source == "aoa_ssa"] == list(range(102, 121))
-    assert (b.assembler.alpha, b.assembler.alpha_since_ns) == (AlphaSource.AOA_SSA, T0 + 101 * TS)
+    # ATTITUDE of sample 105 had made its sample when AOA_SSA came
+    assert [j for j, source in b.sources.items() if source == "vfr_hud"] == list(range(WAIT, 106))
+    assert [j for j, source in b.sources.items() if source == "aoa_ssa"] == list(range(106, 121))
+    assert (b.assembler.alpha, b.assembler.alpha_since_ns) == (AlphaSource.AOA_SSA, T0 + 105 * TS)
 
 
-@pytest.mark.parametrize("came", [1, 40, 200])
-@pytest.mark.parametrize("alpha", ["auto", "aoa_ssa"])
-def test_an_aoa_ssa_that_came_and_stops_has_no_stand_in(alpha: str, came: int) -> None:
-    b = Bench(alpha)
+@pytest.mark.parametrize("came", [MIN_ANGLES, 40, 200])
+def test_an_aoa_ssa_that_came_and_stops_has_no_stand_in(came: int) -> None:
+    b = Bench()
     b.fly(0, came - 1, aoa=True)
     b.fly(came, came + 10 * WAIT)
     assert b.sources == dict.fromkeys(range(came), "aoa_ssa")
+
+
+@pytest.mark.parametrize("came", [1, 40, 200])
+def test_nor_has_one_that_was_asked_for_and_stops(came: int) -> None:
+    b = Bench("aoa_ssa")
+    b.fly(0, came - 1, aoa=True)
+    b.fly(came, came + 10 * WAIT)
+    assert b.sources == dict.fromkeys(range(came), "aoa_ssa")
+
+
+@pytest.mark.parametrize("came", range(1, MIN_ANGLES))
+def test_fewer_than_five_aoa_ssa_before_the_wait_is_over_only_begin_it_anew(came: int) -> None:
+    b = Bench()
+    b.fly(0, 19)
+    b.fly(20, 19 + came, aoa=True)
+    b.fly(20 + came, 300)
+    assert [j for j, source in b.sources.items() if source == "aoa_ssa"] == list(range(20, 20 + came))
+    assert [j for j, source in b.sources.items() if source == "vfr_hud"] == list(range(20 + came + WAIT, 301))
+
+
+@pytest.mark.parametrize("came", range(1, MIN_ANGLES))
+@pytest.mark.parametrize("first", [True, False])
+def test_fewer_than_five_aoa_ssa_change_nothing_where_it_flies_on_vfr_hud(first: bool, came: int) -> None:
+    b = Bench()
+    b.fly(0, 100)
+    for k in range(101, 101 + came):
+        b.now_ns = T0 + k * TS
+        angle = AoaSsa(b.now_ns // 1000, 20.0, 0.0)
+        b.give(*[angle] * first, Attitude(b.now_ns // MS, 0.5, 0.1, 0.0, 0.0, 0.2, 0.0), *[angle] * (not first))
+        b.give(hud(SPEED * math.sin(0.07)))
+    b.fly(101 + came, 300)
+    assert b.sources == dict.fromkeys(range(WAIT, 301), "vfr_hud")
+    np.testing.assert_allclose([sample.x for sample in b.samples], [(0.03, 0.2, 0.1)] * len(b.samples), rtol=1e-6)
+    assert b.assembler.alpha_since_ns == T0 + WAIT * TS
+
+
+def test_stray_aoa_ssa_do_not_add_up_to_five() -> None:
+    b = Bench()
+    b.fly(0, 100)
+    for n in range(2 * MIN_ANGLES):
+        first = 101 + n * (WAIT + 1)
+        b.fly(first, first, aoa=True)
+        b.fly(first + 1, first + WAIT)
+    assert set(b.sources.values()) == {"vfr_hud"}
 
 
 def test_nor_has_one_that_was_asked_for_and_never_came() -> None:
@@ -169,17 +213,38 @@ def test_an_aoa_ssa_from_the_future_decides_nothing() -> None:
     assert b.assembler.alpha is AlphaSource.VFR_HUD
 
 
-def test_a_restarted_plant_is_waited_for_again_unless_its_aoa_ssa_is_known() -> None:
-    for aoa, source in ((False, "vfr_hud"), (True, None)):
-        b = Bench()
-        b.fly(0, 20, aoa=aoa)
-        b.assembler.restart()
-        b.samples.clear()
-        b.assembler.number(0, T0 // MS)
-        b.fly(30, 29 + WAIT)
-        assert b.samples == []
-        b.fly(30 + WAIT, 40 + WAIT)
-        assert set(b.sources.values()) == {source} - {None}
+@pytest.mark.parametrize("aoa", [False, True])
+@pytest.mark.parametrize("last", [20, 200])
+def test_a_restarted_plant_is_waited_for_again_whatever_the_one_before_had(last: int, aoa: bool) -> None:
+    b = Bench()
+    b.fly(0, last, aoa=aoa)
+    b.assembler.restart()
+    assert (b.assembler.alpha, b.assembler.alpha_since_ns) == (AlphaSource.AOA_SSA, None)
+    b.samples.clear()
+    b.assembler.number(0, T0 // MS)
+    b.fly(300, 299 + WAIT)
+    assert b.samples == []
+    b.fly(300 + WAIT, 310 + WAIT)
+    assert b.sources == dict.fromkeys(range(300 + WAIT, 311 + WAIT), "vfr_hud")
+
+
+def test_a_restarted_plant_that_now_sends_aoa_ssa_is_flown_on_it_at_once() -> None:
+    b = Bench()
+    b.fly(0, 200)
+    b.assembler.restart()
+    b.samples.clear()
+    b.assembler.number(0, T0 // MS)
+    b.fly(300, 500, aoa=True)
+    assert b.sources == dict.fromkeys(range(300, 501), "aoa_ssa")
+
+
+@pytest.mark.parametrize(("alpha", "source"), [("aoa_ssa", AlphaSource.AOA_SSA), ("vfr_hud", AlphaSource.VFR_HUD)])
+def test_a_restart_changes_no_choice(alpha: str, source: AlphaSource) -> None:
+    b = Bench(alpha)
+    b.fly(0, 10)
+    b.assembler.restart()
+    b.fly(20, 20 + 5 * WAIT)
+    assert b.assembler.alpha is source
 
 
 def test_a_model_without_angle_of_attack_has_no_source() -> None:

@@ -72,6 +72,16 @@ def test_an_aoa_ssa_that_stops_is_failsafe_and_no_change_of_source() -> None:
     assert (b.mode, told(b)) == ("NEUTRAL", ["aoa_ssa"])
 
 
+def test_one_stray_aoa_ssa_costs_neither_the_mode_nor_the_angle_of_attack() -> None:
+    b = Bench()
+    give(b, 0, 100, aoa=False)
+    b.to(b.t0_ns + 101 * TS)
+    b.give(AoaSsa((b.t0_ns + 101 * TS) // 1000, 20.0, 0.0))
+    give(b, 101, 300, aoa=False)
+    assert (b.mode, told(b)) == ("TRACKING", ["vfr_hud"])
+    assert [c["j"] for c in b.commands] == list(range(80, 301))
+
+
 def test_the_aircraft_follows_its_reference_without_aoa_ssa() -> None:
     rng = np.random.default_rng(1)
 

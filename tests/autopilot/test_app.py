@@ -19,6 +19,7 @@ from autopilot.link.wire import (
     PLANT,
     AoaSsa,
     Attitude,
+    Message,
     NamedValueInt,
     Timesync,
     VfrHud,
@@ -28,7 +29,7 @@ from autopilot.link.wire import (
 from autopilot.reference import Profile, parse_profile
 from gains.store import load_gains
 from gains.table import InputError
-from sitl.plant import PlantConfig
+from sitl.plant import PlantConfig, PlantNode
 from tests.autopilot.bench import X0, Bench
 from tests.helpers import AUTOPILOT_CLOCK, HIRM, MS, PLANT_CLOCK, TS, Flight, S, broken, constant, parse
 
@@ -301,7 +302,7 @@ def test_a_reported_delay_outside_the_window_on_either_side_leaves_tracking(d_mi
     for k in range(10):
         b.sample(k, age_ns=40 * MS)  # forecast 2
     assert b.mode == "TRACKING"
-    b.give(NamedValueInt(b.now_ns // MS, "DELAY_K", reported))
+    b.give(NamedValueInt((b.t0_ns + 10 * TS) // MS, "DELAY_K", reported))
     assert b.mode == mode
 
 
@@ -421,6 +422,86 @@ def test_three_restarts_are_three_epochs():
     assert len(flight.events("epoch")) == 3
     assert flight.bodies("autopilot/command")[-1]["epoch"] == 3
     assert flight.transitions()[-1] == ("STANDBY", "TRACKING")
+
+
+class NoNumbers(PlantNode):
+    """A plant that sends neither SAMPLE_K nor DELAY_K."""
+
+    def _send(self, message: Message) -> None:
+        if not isinstance(message, NamedValueInt):
+            super()._send(message)
+
+
+@pytest.mark.parametrize("step_ns", [30 * MS, -30 * MS, 5 * S])
+def test_a_plant_that_sends_no_numbers_is_flown_again_after_a_step_of_its_clock(step_ns):
+    flight = Flight()
+    flight.plant = NoNumbers(flight.plant_config)
+    flight.network.replace("plant", flight.plant, PLANT_CLOCK)
+    flight.fly(20 * S)
+    # the node keeps its grid, so that a step of the clock is one of the stamps
+    flight.network.replace("plant", flight.plant, replace(PLANT_CLOCK, offset_ns=PLANT_CLOCK.offset_ns + step_ns))
+    flight.fly(27 * S)
+    assert len(flight.events("clock")) == 1
+    assert flight.events("epoch") == []
+    assert flight.autopilot.failsafe.mode is Mode.TRACKING
+    j = [c["j"] for c in flight.bodies("autopilot/command")]
+    assert j == sorted(set(j))
+
+
+@pytest.mark.parametrize("wrong", [10**6, 0])
+def test_one_wrong_number_of_the_plant_is_not_flown(wrong):
+    b = Bench().tracking(60)
+    b.give(NamedValueInt(b.now_ns // MS, "SAMPLE_K", wrong))
+    for k in range(61, 200):
+        b.sample(k)
+    assert b.commands[-1]["j"] == 199
+    assert (len(b.transitions()), b.node.epoch) == (1, 0)
+
+
+def forged(b: Bench, ahead_ns: int) -> None:
+    """Let both halves of a sample come that is stamped ahead of time."""
+    t_ns = b.now_ns + ahead_ns
+    b.give(AoaSsa(t_ns // 1000, 1.0, 0.0), Attitude((t_ns // MS) % (1 << 32), 0.0, 0.05, 0.0, 0.0, 0.0, 0.0))
+
+
+def test_numbers_that_were_wrong_twice_are_a_new_epoch_when_they_are_right_again():
+    b = Bench().tracking(60)
+    for k in (61, 62):
+        b.give(NamedValueInt((b.t0_ns + k * TS) // MS, "SAMPLE_K", k + 10**6))
+    forged(b, 2 * TS)
+    assert b.commands[-1]["j"] > 10**6
+    for k in range(63, 100):
+        b.sample(k)
+    assert [e["text"] for e in b.events if e["kind"] == "epoch"] == ["sample numbers fell back, epoch 1"]
+    assert (b.mode, b.commands[-1]["j"]) == ("TRACKING", 99)
+
+
+def test_a_sample_from_far_ahead_while_the_clock_is_lost_costs_a_second():
+    b = Bench().tracking(60)
+    b.answers = False
+    for k in range(61, 741):
+        b.sample(k)
+    forged(b, 10 * DAY)
+    b.answers = True
+    came = len(b.commands)
+    for k in range(741, 900):
+        b.sample(k)
+    assert [e["text"] for e in b.events if e["kind"] == "epoch"] == ["stamps fell back, epoch 1"]
+    assert [c["j"] for c in b.commands[came:]] == list(range(741 + S // TS, 900))
+    assert b.mode == "TRACKING"
+
+
+@pytest.mark.parametrize("ahead_ns", [10 * DAY, 100 * DAY, 584_000 * 365 * DAY - 600 * S])
+def test_a_sample_from_far_ahead_before_the_clock_is_known_costs_a_second_at_most(ahead_ns):
+    b = Bench(answers=False)
+    b.to(b.now_ns + 10 * MS)
+    forged(b, min(ahead_ns, ((1 << 64) - 1) * 1000 - b.now_ns))
+    b.answers = True
+    for k in range(100):
+        b.sample(k)
+    assert b.mode == "TRACKING"
+    assert b.commands[-1]["j"] == 99
+    assert all(c["sample_ns"] < 1 << 62 for c in b.commands)
 
 
 def test_reordering_is_no_restart():

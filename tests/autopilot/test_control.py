@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from autopilot.control import SETTLE_SAMPLES, TELL_NS, Law, SetChanges, SetChooser, Window, law_of
+from autopilot.control import SETTLE_SAMPLES, TELL_NS, ChosenSets, Law, SetChanges, SetChooser, Window, law_of
 from gains.model import Gains, Trim
 from gains.store import load_gains
 from gains.table import InputError
@@ -266,6 +266,39 @@ def test_a_delay_that_wanders_about_an_edge_switches_at_most_once():
 def test_one_set_is_chosen_whatever_the_forecast():
     chooser = SetChooser(((1, 3),))
     assert {chooser.choose(d, d, d) for d in DELAYS} == {0}
+
+
+def test_a_set_is_remembered_for_the_longest_delay_of_the_windows_and_no_longer():
+    for d, fits in ((6, False), (7, True)):  # one sample later nothing is known, and nothing said
+        chosen = ChosenSets(((1, 3), (2, 6)))
+        chosen.note(10, 0)
+        chosen.note(10 + d, 1)
+        assert chosen.covers(10, 6) is fits
+
+
+def test_a_command_fits_its_set_to_within_one_sample_and_its_first_delay_counts():
+    for d in range(8):
+        chosen = ChosenSets(((1, 3), (2, 6)))
+        chosen.note(10, 0)
+        assert chosen.covers(10, d) is (d <= 4)
+        assert chosen.covers(10, 6)
+
+
+def test_memory_stays_bounded_over_a_lossy_link():
+    rng = np.random.default_rng(1)
+    chosen = ChosenSets(((1, 3), (2, 6)))
+    for j in np.flatnonzero(rng.random(100_000) > 0.1).tolist():
+        chosen.note(j, j % 2)
+        assert len(chosen._sets) <= 7
+        assert min(chosen._sets) >= j - 6
+
+
+def test_memory_stays_bounded_when_numbers_fall_back():
+    chosen = ChosenSets(((1, 3), (2, 6)))
+    for first in (100_000, 50_000, 0):
+        for j in range(first, first + 1000):
+            chosen.note(j, 0)
+            assert len(chosen._sets) <= 7
 
 
 @given(st.lists(st.tuples(st.integers(0, 3 * TELL_NS), st.integers(0, 3)), max_size=60))

@@ -233,10 +233,10 @@ def test_forget_leaves_nothing_but_the_scores():
 
 
 @pytest.mark.parametrize("n", [5, 20, 63, 64, 200])
-def test_one_delay_in_n_transits_is_certain_to_n_of_n_plus_1(n):
+def test_one_delay_in_n_transits_is_certain_to_n_minus_1_of_n_plus_1(n):
     loop = Loop().transits(n)
     loop.estimator.renew(loop.line())
-    assert loop.forecast().probability == pytest.approx(n / (n + 1))
+    assert loop.forecast().probability == pytest.approx((n - 1) / (n + 1))
 
 
 def test_the_forecast_is_converging_while_it_rests_on_few_transits():
@@ -266,7 +266,8 @@ def by_shares(*shares_d: tuple[int, int]) -> DelayEstimate:
         (((51, 2), (49, 1)), 2, 1, 2, 1.0),
         (((97, 2), (3, 3)), 2, 2, 2, 0.97),
         (((97, 3), (3, 1)), 3, 3, 3, 0.97),
-        (((95, 2), (5, 3)), 2, 2, 3, 1.0),  # 0.95 of it is a little less with 100 transits
+        (((95, 2), (5, 3)), 2, 2, 2, 0.95),
+        (((94, 2), (6, 3)), 2, 2, 3, 1.0),
         (((20, 1), (60, 2), (20, 3)), 2, 1, 3, 1.0),
         (((3, 1), (60, 2), (37, 3)), 2, 2, 3, 0.97),
         (((37, 1), (60, 2), (3, 3)), 2, 1, 2, 0.97),
@@ -277,7 +278,7 @@ def test_d_is_the_likeliest_and_its_interval_the_narrowest_with_95_percent(share
     # without ages nobody is overtaken
     forecast = by_shares(*shares)
     assert (forecast.d, forecast.low, forecast.high) == (d, low, high)
-    assert forecast.probability == pytest.approx(probability * 100 / 101)
+    assert forecast.probability == pytest.approx(min(probability, 99 / 101))
 
 
 @quick
@@ -292,12 +293,12 @@ def test_the_interval_contains_d_with_its_probability_by_the_transits_themselves
     counts = np.bincount(d)
     assert counts[forecast.d] == counts.max()
     assert forecast.low <= forecast.d <= forecast.high
-    inside = ((forecast.low <= d) & (d <= forecast.high)).mean() * n / (n + 1)
-    assert forecast.probability == pytest.approx(inside)
-    assert forecast.probability >= COVERAGE or (forecast.low, forecast.high) == (d.min(), d.max())
+    inside = ((forecast.low <= d) & (d <= forecast.high)).mean()
+    assert forecast.probability == pytest.approx(min(inside, (n - 1) / (n + 1)))
+    assert inside >= COVERAGE or (forecast.low, forecast.high) == (d.min(), d.max())
     if forecast.low < forecast.high:
         ends = min(counts[forecast.low], counts[forecast.high])
-        assert counts[forecast.low : forecast.high + 1].sum() - ends < COVERAGE * (n + 1) or ends == 0
+        assert counts[forecast.low : forecast.high + 1].sum() - ends < COVERAGE * n or ends == 0
 
 
 # a plant that latches and reports
@@ -577,7 +578,7 @@ def test_absurd_stamps_never_raise_and_are_not_remembered(stamp):
         e.sent(500 + n, stamp, now_ns, told_d)
         e.report(500 + n, 499 + n, now_ns)
         e.report(501 + n, 500 + n, now_ns)
-        if abs(stamp) > 1 << 60:
+        if abs(stamp) > 1 << 61:
             e.transit(stamp, now_ns, now_ns)
             e.transit(now_ns, stamp, now_ns)
     e.renew(line)
@@ -595,7 +596,7 @@ def test_absurd_stamps_of_samples_never_raise_on_a_jittery_link(stamp, ages):
     old, future = (loop.estimator.forecast(sign * stamp, loop.now_ns) for sign in (-1, 1))
     assert old.d > 10**9
     assert 0 <= old.high - old.low <= 3
-    assert future.d == 1
+    assert future is UNKNOWN  # no sample is taken after its command
 
 
 def test_one_absurd_transit_among_others_costs_no_time_and_changes_no_forecast():
@@ -604,7 +605,17 @@ def test_one_absurd_transit_among_others_costs_no_time_and_changes_no_forecast()
     loop.estimator.renew(loop.line())
     forecast = loop.forecast()
     assert forecast[:3] == (1, 1, 1)
-    assert forecast.probability == pytest.approx(100 / 101 * 101 / 102)
+    assert forecast.probability == pytest.approx(100 / 102)
+
+
+def test_a_stall_of_the_plant_is_no_property_of_the_link():
+    loop = Loop(10 * MS).transits(60, 12 * MS, 18 * MS)
+    for n in range(20):  # requests of 2 s, all read when the plant wakes up
+        loop.transits(1, (20 - n) * 100 * MS)
+    loop.transits(5, 12 * MS, 18 * MS)
+    loop.estimator.renew(loop.line())
+    forecast = loop.forecast()
+    assert (forecast.low, forecast.high) == (1, 2)
 
 
 # scores
@@ -631,6 +642,16 @@ def test_exact_and_covered_are_the_shares_of_the_latest_forecasts():
 # bounds
 
 
+def test_what_is_never_renewed_is_bounded_too():
+    e = DelayEstimator(TS)
+    for n in range(20_000):
+        e.sent(n, n * TS, n * TS + 10 * MS, UNKNOWN)
+        e.report(n + 1, n, n * TS + 20 * MS)
+    assert len(e._ages._new) == delay.MAX_AGES
+    assert len(e._reports._new) == delay.MAX_REPORTS
+    assert not e.due  # without a transit there is nothing to describe
+
+
 def test_memory_is_bounded_over_100000_calls():
     link = Link(gamma_ms(20, 20), uniform_ms(5, 15))
     e = link.estimator
@@ -651,7 +672,9 @@ def test_memory_is_bounded_over_100000_calls():
     tracemalloc.stop()
     assert grown < 300_000
     for name, most in (("_transits", delay.MAX_TRANSITS), ("_ages", delay.MAX_AGES), ("_reports", delay.MAX_REPORTS)):
-        assert getattr(e, name).size <= most
+        window = getattr(e, name)
+        assert len(window._rows) <= most
+        assert len(window._new) <= most
     assert len(e._sent) <= delay.MAX_SENT
     assert len(e._latched) <= delay.MAX_SENT
     assert all(a < b for a, b in pairwise(e._latched))

@@ -202,7 +202,7 @@ def test_a_half_that_is_lost_on_the_link_is_hold_then_neutral_then_the_law_again
     assert [str(e["data"]["event"]) for e in flight.events("failsafe", 3 * S)] == ["half", "expired", "good"]
     assert name in texts(flight)
     hold, _, back = flight.when("failsafe")[1:]
-    assert 4 * S < hold < 4 * S + 7 * TS
+    assert 4 * S < hold < 4 * S + 8 * TS
     assert 6 * S < back < 6 * S + 6 * TS
 
 

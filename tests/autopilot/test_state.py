@@ -10,7 +10,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from autopilot.link.wire import AoaSsa, Attitude
-from autopilot.state import JUMP_BACK_NS, MAX_PENDING, NUMBER_WAIT_NS, Drop, Sample, SampleAssembler
+from autopilot.state import (
+    JUMP_BACK_NS,
+    MAX_PENDING,
+    MAX_STAMP_NS,
+    NUMBER_WAIT_NS,
+    RESYNC_MEASUREMENTS,
+    RESYNC_NS,
+    Drop,
+    Sample,
+    SampleAssembler,
+)
 from gains.store import load_model
 from tests.helpers import HIRM, MS, TS, S
 
@@ -197,6 +207,77 @@ def test_a_plant_that_sends_no_numbers_is_numbered_from_the_first_sample_seen():
     assert list(came.values()) == list(range(first, 200))
 
 
+def tell(assembler: SampleAssembler, k: int, number: int | None = None) -> Sample | None:
+    """Give the plant's number of sample k, or a wrong one."""
+    return assembler.number(k if number is None else number, halves(k)[0].time_boot_ms)
+
+
+@pytest.mark.parametrize("wrong", [0, 44, 46, 10**6, (1 << 31) - 1, -1, -(1 << 31)])
+def test_one_wrong_number_changes_nothing(wrong):
+    assembler = numbered()
+    numbers = []
+    for k in range(200):
+        if k % 40 == 0:
+            tell(assembler, k)
+        if k == 45:
+            tell(assembler, k, wrong)
+            tell(assembler, k, wrong)  # a copy of it confirms nothing
+        numbers += [s.j for s in feed(assembler, halves(k))]
+    assert numbers == list(range(200))
+    assert assembler.lost == ""
+
+
+def test_two_numbers_that_agree_are_believed_against_the_running_one():
+    assembler = numbered()
+    feed(assembler, halves(0))
+    tell(assembler, 10, 1010)
+    assert [s.j for s in feed(assembler, halves(11))] == [11]
+    tell(assembler, 50, 1050)
+    assert [s.j for s in feed(assembler, halves(51))] == [1051]
+
+
+def test_a_number_between_them_that_agrees_with_the_running_one_keeps_it():
+    assembler = numbered()
+    for k, number in ((10, 1010), (20, 20), (30, 1030)):
+        tell(assembler, k, number)
+    assert [s.j for s in feed(assembler, halves(31))] == [31]
+
+
+def test_numbers_that_fall_back_twice_lose_the_track_and_those_of_the_new_epoch_are_believed_at_once():
+    assembler = numbered(10**6)
+    feed(assembler, halves(10**6))
+    for k in (10**6 + 40, 10**6 + 80):
+        assert assembler.lost == ""
+        assembler.number(k - 10**6, halves(k)[0].time_boot_ms)
+    assert assembler.lost == "sample numbers fell back"
+    assembler.restart()
+    assert assembler.lost == ""
+    tell(assembler, 10**6 + 80, 80)
+    assert [s.j for s in feed(assembler, halves(10**6 + 81))] == [81]
+
+
+def test_a_number_that_falls_back_a_little_is_no_new_epoch():
+    assembler = numbered()
+    feed(assembler, halves(39))
+    for k in (40, 80):
+        tell(assembler, k, k - 2)
+    assert [s.j for s in feed(assembler, halves(81))] == [79]
+    assert assembler.lost == ""
+
+
+def test_without_numbers_of_the_plant_a_forgotten_number_goes_on_from_the_last():
+    assembler = SampleAssembler(MODEL)
+    came = []
+    for k in range(400):
+        if k == 200:
+            assembler.forget_number()
+        came += [(k, s.j) for s in feed(assembler, halves(k, T0 + 30 * MS * (k >= 200)), now_ns=k * TS)]
+    wait = NUMBER_WAIT_NS // TS
+    assert [k for k, _ in came] == [*range(wait, 200), *range(200 + wait, 400)]
+    assert [j for _, j in came] == [k for k, _ in came]
+    assert assembler.lost == ""
+
+
 # clocks
 
 
@@ -309,6 +390,90 @@ def test_a_new_epoch_starts_from_nothing_and_keeps_its_counters():
     samples = feed(assembler, [m for k in range(5) for m in halves(k)])
     assert [s.j for s in samples] == list(range(5))
     assert assembler.drops == {Drop.JUMPED_BACK: 2}
+
+
+@pytest.mark.parametrize("time_usec", [MAX_STAMP_NS // 1000 + 1, (1 << 63) - 1, (1 << 64) - 1])
+@pytest.mark.parametrize("peer_ns", [None, T0, (1 << 63) - 1])
+def test_a_stamp_that_no_clock_shows_is_refused(time_usec, peer_ns):
+    assembler = SampleAssembler(MODEL)
+    assert assembler.add(AoaSsa(time_usec, 0.0, 0.0), 0, peer_ns) is None
+    assert assembler.drops == {Drop.FROM_THE_FUTURE: 1}
+    assert assembler.newest_ns is None
+
+
+# the way back
+
+
+def ahead(days: float = 10.0) -> SampleAssembler:
+    """Return an assembler whose newest sample is stamped far ahead of the plant's time."""
+    assembler = numbered()
+    feed(assembler, halves(round(days * 86_400 * S) // TS))
+    return assembler
+
+
+def lost_at(assembler: SampleAssembler, stream, peer_ns: int | None = None) -> tuple[int, int] | None:
+    """Feed (own time, message); return when the track was lost, and after how many messages."""
+    for n, (now_ns, message) in enumerate(stream, 1):
+        assembler.add(message, now_ns, peer_ns)
+        if assembler.lost:
+            return now_ns, n
+    return None
+
+
+@pytest.mark.parametrize("days", [0.001, 1.0, 10.0, 20.0])
+def test_stamps_that_rise_with_time_but_are_older_than_the_newest_lose_the_track_after_a_second(days):
+    stream = [(k * TS, m) for k in range(100) for m in halves(k)]
+    assembler = ahead(days)
+    came = lost_at(assembler, stream)
+    assert came is not None
+    assert came[0] == RESYNC_NS
+    assert assembler.lost == "stamps fell back"
+    assembler.restart()
+    tell(assembler, 41)
+    assert [s.j for s in feed(assembler, [m for k in range(41, 50) for m in halves(k)])] == list(range(41, 50))
+
+
+def test_on_a_lossy_link_the_track_is_lost_after_so_many_measurements():
+    stream = [(k * TS, halves(k)[1]) for k in range(0, 1000, 8)]
+    assert lost_at(ahead(), stream) == ((RESYNC_MEASUREMENTS - 1) * 8 * TS, RESYNC_MEASUREMENTS)
+
+
+def test_old_stamps_that_do_not_rise_with_time_are_no_lost_track():
+    burst = [(0, m) for k in range(200) for m in halves(k)]  # all at once
+    still = [(k * TS, halves(0)[1]) for k in range(1000)]  # one, again and again
+    seldom = [(k * TS, halves(k)[1]) for k in range(0, 4000, 85)]
+    for stream in (burst, still, seldom):
+        assert lost_at(ahead(), stream) is None
+
+
+def test_stamps_after_the_plants_time_are_no_lost_track():
+    stream = [(k * TS, m) for k in range(1000) for m in halves(400 + k)]
+    assert lost_at(ahead(), stream, T0 - S) is None
+
+
+def test_old_copies_between_samples_that_come_are_no_lost_track():
+    stream = []
+    for k in range(100, 1000):
+        stream += [(k * TS, m) for old in (90, 50, 20) for m in halves(k - old)]
+        if k % 30 == 0:
+            stream += [(k * TS, m) for m in halves(k)]
+    assert lost_at(numbered(), stream) is None
+
+
+def test_halves_from_far_ahead_starve_no_sample():
+    assembler = numbered()
+    feed(assembler, [halves(10**6 + k)[1] for k in range(MAX_PENDING)])
+    assert [s.j for s in feed(assembler, [m for k in range(20) for m in halves(k)])] == list(range(20))
+
+
+def test_a_sample_stamped_turns_ahead_before_the_clock_is_known_does_not_keep_its_number():
+    assembler = SampleAssembler(load_model("pendulum"))
+    t0_ms, turn = T0 // MS, 1 << 32
+    assembler.number(0, t0_ms)
+    for ms in (t0_ms, t0_ms + turn // 3, t0_ms + 2 * (turn // 3), t0_ms + 30):
+        assert assembler.add(Attitude(ms % turn, *(6 * [0.0])), 0) is not None
+    assert assembler.add(Attitude(t0_ms + 60, *(6 * [0.0])), 0, T0 + 60 * MS) is None
+    assert assembler.lost == "sample numbers fell back"
 
 
 def test_a_model_that_needs_attitude_alone_is_whole_with_it():

@@ -33,9 +33,27 @@ def test_a_restarted_plant_is_a_new_epoch_and_is_flown_within_three_seconds(offs
     reborn = NOMINAL.plant_node()
     network.replace("plant", reborn, Clock(offset_s * S, 40_000, died_ns))
     network.run(lambda: reborn.samples >= 200, 60 * S)
-    assert [text for _, text in events_of(records, "epoch", died_ns)] == ["plant restarted, epoch 1"]
+    why = "sample numbers fell back" if offset_s == 500 else "plant restarted"
+    assert [text for _, text in events_of(records, "epoch", died_ns)] == [f"{why}, epoch 1"]
     tracking = [at for at, text in events_of(records, "failsafe", died_ns) if "to TRACKING" in text]
     assert tracking[0] < 3.0
+    last = [r.body for r, _ in records if r.topic == "autopilot/command"][-1]
+    assert (last["mode"], last["epoch"]) == ("TRACKING", 1)
+    assert reborn.samples - 5 <= last["j"] < reborn.samples
+
+
+def test_a_plant_that_restarts_while_its_clock_goes_on_is_a_new_epoch_within_two_numbers() -> None:
+    records: list[tuple[Record, int]] = []
+    network, plant = virtual_network(NOMINAL, lambda r, at: records.append((r, at)))
+    network.run(lambda: plant.samples >= 200, 60 * S)
+    died_ns, clock = network.now_ns, NOMINAL.clocks["plant"]
+    reborn = NOMINAL.plant_node()
+    network.replace("plant", reborn, clock)
+    network.run(lambda: reborn.samples >= 200, 60 * S)
+    assert events_of(records, "clock", died_ns) == []
+    [(at_s, text)] = events_of(records, "epoch", died_ns)
+    assert text == "sample numbers fell back, epoch 1"
+    assert at_s < 2.5
     last = [r.body for r, _ in records if r.topic == "autopilot/command"][-1]
     assert (last["mode"], last["epoch"]) == ("TRACKING", 1)
     assert reborn.samples - 5 <= last["j"] < reborn.samples
