@@ -242,6 +242,7 @@ class AutopilotNode:
         self.epoch += 1
         self._steps_seen = self.clock.steps
         self.samples.restart()
+        self.delay.forget_commands()
         self.halves.forget()
         self.pilot.restart()
         self._event("epoch", f"{why}, epoch {self.epoch}", now_ns)

@@ -30,6 +30,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from autopilot.clocksync import ClockLine
+from autopilot.history import Window, read_together, without_stalls
 from autopilot.link.clock import NS_PER_S, NS_PER_US
 from autopilot.transits import EVEN, Reports, TransitLaw, least_shift, transit_law
 
@@ -63,11 +64,6 @@ RENEW_REPORTS = 640
 """or after so many reports."""
 RENEW_SHARE = 4
 """While there are few: when the new ones are one in so many."""
-
-STALL_REQUESTS = 5
-"""So many requests in a row that were read together, within"""
-STALL_SHARE = 0.1
-"""this share of the time between their sending, are a stall of the peer."""
 
 CHANGE_TRANSITS = 16
 """Transits in a row that may show a change of the link, among at least as many before."""
@@ -127,37 +123,6 @@ class DelayEstimate(NamedTuple):
 UNKNOWN = DelayEstimate(None, None, None, None, DelayStatus.UNKNOWN)
 
 
-class _Window:
-    """The latest rows of integers, bounded; cheap to append to."""
-
-    def __init__(self, capacity: int, columns: int) -> None:
-        self._capacity = capacity
-        self._rows = np.zeros((0, columns), dtype=np.int64)
-        self._new: deque[tuple[int, ...]] = deque(maxlen=capacity)
-        self.append = self._new.append
-
-    @property
-    def new(self) -> int:
-        """Rows since the last call of :meth:`rows`."""
-        return len(self._new)
-
-    @property
-    def size(self) -> int:
-        """Rows kept."""
-        return min(len(self._rows) + len(self._new), self._capacity)
-
-    def rows(self) -> NDArray[np.int64]:
-        """Return all rows, oldest first."""
-        if self._new:
-            self._rows = np.concatenate([self._rows, np.array(self._new, dtype=np.int64)])[-self._capacity :]
-            self._new.clear()
-        return self._rows
-
-    def keep(self, last: int) -> None:
-        """Drop all but the last rows."""
-        self._rows = self.rows()[len(self._rows) - min(last, len(self._rows)) :]
-
-
 class DelayEstimator:
     """What is known of the way of the commands; own times passed in, no I/O.
 
@@ -190,9 +155,9 @@ class DelayEstimator:
         """Drop all that is known: the plant's clock has stepped, or the plant is a new one."""
         self.due = False
         self.shift_ns = 0
-        self._transits = _Window(MAX_TRANSITS, 2)
-        self._ages = _Window(MAX_AGES, 2)
-        self._reports = _Window(MAX_REPORTS, 3)
+        self._transits = Window(MAX_TRANSITS, 2)
+        self._ages = Window(MAX_AGES, 2)
+        self._reports = Window(MAX_REPORTS, 3)
         self._sent: dict[int, tuple[int, int, DelayEstimate]] = {}
         self._latched: dict[int, int] = {}
         self._last_request = (0, 0)
@@ -221,9 +186,11 @@ class DelayEstimator:
         self._transits.append((ts1, tc1 - ts1))
         self._see_due()
         (sent_ns, read_ns), self._last_request = self._last_request, (ts1, tc1)
-        waited = abs(tc1 - read_ns) < STALL_SHARE * (ts1 - sent_ns)  # for a peer that stood still
+        if self._suspected:
+            self._in_doubt += 1
         law = self._law
-        if law is not None and not waited and len(law.transits) >= CHANGE_TRANSITS:
+        stalled = read_together(ts1 - sent_ns, tc1 - read_ns)
+        if law is not None and not stalled and len(law.transits) >= CHANGE_TRANSITS:
             self._see_change(tc1 - ts1 - self._line.at(ts1), law.transits)
 
     def _see_change(self, transit_ns: int, transits: list[int]) -> None:
@@ -237,12 +204,8 @@ class DelayEstimator:
         mean = abs(sum(self._levels)) / n
         sigma = math.sqrt((1.0 / n + 1.0 / known) / 12.0)  # of two samples of one distribution (Mann and Whitney)
         new = _at_one_end(self._levels)
-        if self._suspected:
-            self._in_doubt += 1
-            changed = new >= SUSPECT_TRANSITS
-        else:
-            changed = n == CHANGE_TRANSITS and mean > CHANGE_SIGMA * sigma
-        if changed:
+        changed = n == CHANGE_TRANSITS and mean > CHANGE_SIGMA * sigma
+        if new >= SUSPECT_TRANSITS if self._suspected else changed:
             self.changes += 1
             self._restart(new if new >= MIN_TRANSITS else n)
         elif len(self._levels) == CHANGE_TRANSITS:
@@ -260,6 +223,11 @@ class DelayEstimator:
     def repeated(self, j: int) -> None:
         """Take note that the command of sample j is sent once more: its first delay would tell nothing any more."""
         self._sent.pop(j, None)
+
+    def forget_commands(self) -> None:
+        """Drop what is under way: the plant counts its samples anew. What is known of the link stays."""
+        self._sent.clear()
+        self._latched.clear()
 
     def report(self, k: int, j: int, now_ns: int) -> None:
         """Take the plant's word that the command of sample j was in force at its sample k."""
@@ -335,7 +303,7 @@ class DelayEstimator:
         exchanges = self._transits.rows()
         if self._in_doubt < len(exchanges):
             exchanges = exchanges[: len(exchanges) - self._in_doubt]  # the others may be of another link
-        exchanges = _without_stalls(exchanges)
+        exchanges = without_stalls(exchanges)
         transits = exchanges[:, 1] - self._offsets(exchanges[:, 0])
         reports = self._reports.rows()
         ages = reports[:, 0] + self._offsets(reports[:, 0]) - reports[:, 1]
@@ -434,24 +402,6 @@ class DelayEstimator:
                 covered += weights[high]
         probability = min(self._certain, covered / total)
         return DelayEstimate(first + best, first + low, first + high, probability, self._status)
-
-
-def _without_stalls(exchanges: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the exchanges, rows of (sent, transit), without those that only waited for the peer to wake up.
-
-    A peer that stood still reads all requests of that time at once: they say how long it stood, not how long the
-    way is. Of STALL_REQUESTS or more in a row that were read together only the last, which waited least, is kept.
-    """
-    if len(exchanges) <= STALL_REQUESTS:
-        return exchanges
-    sent_ns, read_ns = exchanges[:, 0], exchanges.sum(axis=1)
-    together = np.abs(np.diff(read_ns)) < STALL_SHARE * np.diff(sent_ns)
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], together.view(np.int8), [0]])))
-    keep = np.ones(len(exchanges), dtype=np.bool_)
-    for begin, end in zip(edges[::2], edges[1::2], strict=True):
-        if end - begin + 1 >= STALL_REQUESTS:
-            keep[begin:end] = False
-    return exchanges[keep]
 
 
 def _at_one_end(levels: deque[float]) -> int:

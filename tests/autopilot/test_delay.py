@@ -618,6 +618,19 @@ def test_a_stall_of_the_plant_is_no_property_of_the_link():
     assert (forecast.low, forecast.high) == (1, 2)
 
 
+def test_a_plant_that_counts_anew_is_not_taken_for_the_one_before():
+    e = DelayEstimator(TS)
+    for k in range(40, 60):
+        e.sent(k, k * TS, k * TS + 10 * MS, UNKNOWN)
+        e.report(k + 1, k, k * TS + 30 * MS)
+    e.forget_commands()
+    for k in range(45):
+        e.sent(k, k * TS, k * TS + 10 * MS, UNKNOWN)
+    before = e._reports.size
+    e.report(41, 39, 0)  # the old plant had the command of sample 41 in force at 42, the new one has not
+    assert e._reports.size == before
+
+
 # scores
 
 
