@@ -15,6 +15,7 @@ from autopilot.link.process import ADDRESS, ProcessOptions, process_options, run
 from autopilot.link.udp import Address, dial
 from autopilot.reference import parse_profile
 from gains.command import FiniteRange, run, version
+from gains.model import Schedule
 from gains.store import load_law
 from gains.table import InputError
 
@@ -23,7 +24,7 @@ __all__ = ["main"]
 MAX_GROUND_STATIONS = 8
 
 
-@click.command()
+@click.command(context_settings={"help_option_names": ["-h", "--help"]})
 @click.option(
     "--gains",
     "gains_name",
@@ -138,6 +139,8 @@ def cli(
         ground_timeout_ns=round(ground_timeout_s * NS_PER_S),
         ground_stations=len(stations),
     )
+    if isinstance(gains, Schedule) and gains.certificate is not None:  # of all switching: it may take half a minute
+        click.echo(f"autopilot: checking the certificate of schedule {gains.name}", err=True)
     node = AutopilotNode(config)
     proof = node.proof
     for each, verification in ((gains, proof), (gains.conservative, node.conservative_proof)):

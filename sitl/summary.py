@@ -257,7 +257,7 @@ def summary_table(summary: Mapping[str, Any], verdicts: Sequence[Verdict]) -> Gr
     delay = summary["delay"]
     grid.add_row("flight", f"{summary['samples']} samples, {summary['duration_s']:g} s, seed {summary['seed']}")
     grid.add_row("gains", f"{summary['gains']} on {summary['plant']} (certificate: {summary['certificate']})")
-    if summary["conservative"] is not None:
+    if summary.get("conservative") is not None:
         wide = summary["conservative"]
         grid.add_row("conservative gains", f"{wide['gains']} (certificate: {wide['certificate']})")
     rms, peak, final = (np.degrees(summary[f"{m}_error_rad"]) for m in ("rms", "max", "final"))
