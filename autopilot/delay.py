@@ -65,6 +65,9 @@ RENEW_REPORTS = 640
 RENEW_SHARE = 4
 """While there are few: when the new ones are one in so many."""
 
+FADE_SHARE = 0.04
+"""What the next transit may differ from all before, where these are all alike, as a share of Ts: 1 ms of 25."""
+
 CHANGE_TRANSITS = 16
 """Transits in a row that may show a change of the link, among at least as many before."""
 CHANGE_SIGMA = 5.0
@@ -170,7 +173,7 @@ class DelayEstimator:
         self._law: TransitLaw | None = None
         self._line = ClockLine(0, 0, 0.0)
         self._skew = 0.0
-        self._certain = 0.0
+        self._fade_ns = 0.0
         self._status = DelayStatus.UNKNOWN
         self._heard_ns = self._transit_ns = 0
 
@@ -323,7 +326,8 @@ class DelayEstimator:
         )
         self._density = self._law.density
         n = len(self._law.transits)
-        self._certain = (n - 1) / (n + 1)  # the chance that one more lies between the extremes of n: no more is known
+        spread_ns = self._law.transits[-1] - self._law.transits[0]
+        self._fade_ns = max(spread_ns / math.log(n + 1), self.Ts_ns * FADE_SHARE)
         self._status = DelayStatus.ESTIMATED if n >= MANY_TRANSITS else DelayStatus.CONVERGING
 
     def _restart(self, transits: int) -> None:
@@ -375,7 +379,7 @@ class DelayEstimator:
                 return UNKNOWN  # no command arrives before its sample was taken: the stamps are wrong
             first, last = 1, max(1, last)
         if first == last:
-            return DelayEstimate(first, first, first, self._certain, self._status)
+            return DelayEstimate(first, first, first, self._most(law, age_ns, first, first), self._status)
         last = min(last, first + MAX_SPREAD)
         opened = law.open_at(age_ns)
         known = len(opened) - 1
@@ -386,9 +390,9 @@ class DelayEstimator:
             weights.append(weight)
             total += weight
             before, limit_ns = level, limit_ns + Ts_ns
-        return self._summary(first, weights, total)
+        return self._summary(law, age_ns, first, weights, total)
 
-    def _summary(self, first: int, weights: list[float], total: float) -> DelayEstimate:
+    def _summary(self, law: TransitLaw, age_ns: int, first: int, weights: list[float], total: float) -> DelayEstimate:
         """Return the likeliest of the delays from ``first`` on, and the interval around it."""
         best = weights.index(max(weights))
         low = high = best
@@ -400,8 +404,22 @@ class DelayEstimator:
             else:
                 high += 1
                 covered += weights[high]
-        probability = min(self._certain, covered / total)
+        probability = min(self._most(law, age_ns, first + low, first + high), covered / total)
         return DelayEstimate(first + best, first + low, first + high, probability, self._status)
+
+    def _most(self, law: TransitLaw, age_ns: int, low: int, high: int) -> float:
+        """Return the most that n transits can say for an interval of delays: one more may lie beyond them all.
+
+        It does so with probability 1 / (n + 1) on each side; that it also leaves the interval is taken to fade
+        exponentially with the room up to its end, on the scale on which n transits have spread.
+        """
+        transits = law.transits
+        room_ns = high * self.Ts_ns - age_ns - transits[-1]
+        beyond = math.exp(-room_ns / self._fade_ns) if room_ns >= 0 else 0.0
+        room_ns = transits[0] - (low - 1) * self.Ts_ns + age_ns
+        if low > 1 and room_ns >= 0:
+            beyond += math.exp(-room_ns / self._fade_ns)
+        return 1.0 - beyond / (len(transits) + 1)
 
 
 def _at_one_end(levels: deque[float]) -> int:

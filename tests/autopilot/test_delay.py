@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import heapq
+import math
 import tracemalloc
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -233,10 +234,28 @@ def test_forget_leaves_nothing_but_the_scores():
 
 
 @pytest.mark.parametrize("n", [5, 20, 63, 64, 200])
-def test_one_delay_in_n_transits_is_certain_to_n_minus_1_of_n_plus_1(n):
+def test_alike_transits_leave_little_doubt_five_milliseconds_before_the_sample(n):
     loop = Loop().transits(n)
     loop.estimator.renew(loop.line())
-    assert loop.forecast().probability == pytest.approx((n - 1) / (n + 1))
+    assert loop.forecast().probability == pytest.approx(1.0 - math.exp(-5.0) / (n + 1))
+
+
+@pytest.mark.parametrize("n", [5, 12, 40])
+@pytest.mark.parametrize("kind", ["gamma", "uniform"])
+def test_few_transits_hold_at_least_as_often_as_they_say(kind, n):
+    rng = np.random.default_rng(n)
+    stated, held = [], []
+    for _ in range(200):
+        jitter = 5 * rng.standard_gamma(2, n + 50) if kind == "gamma" else 30 * rng.random(n + 50)
+        downs = ((20 + jitter) * MS).astype(int).tolist()
+        loop = Loop(int(rng.integers(0, 25)) * MS).transits(n, *downs[:n])
+        loop.estimator.renew(loop.line())
+        forecast = loop.forecast()
+        d = np.array([true_d(loop.up_ns + down) for down in downs[n:]])
+        stated.append(forecast.probability)
+        held.append(np.mean((forecast.low <= d) & (d <= forecast.high)))
+    assert np.mean(stated) - 0.02 < np.mean(held)
+    assert np.mean(held) - np.mean(stated) < 0.1
 
 
 def test_the_forecast_is_converging_while_it_rests_on_few_transits():
@@ -278,7 +297,7 @@ def test_d_is_the_likeliest_and_its_interval_the_narrowest_with_95_percent(share
     # without ages nobody is overtaken
     forecast = by_shares(*shares)
     assert (forecast.d, forecast.low, forecast.high) == (d, low, high)
-    assert forecast.probability == pytest.approx(min(probability, 99 / 101))
+    assert probability - 2 / 101 <= forecast.probability <= probability  # one more than 100 may lie beyond them
 
 
 @quick
@@ -294,11 +313,11 @@ def test_the_interval_contains_d_with_its_probability_by_the_transits_themselves
     assert counts[forecast.d] == counts.max()
     assert forecast.low <= forecast.d <= forecast.high
     inside = ((forecast.low <= d) & (d <= forecast.high)).mean()
-    assert forecast.probability == pytest.approx(min(inside, (n - 1) / (n + 1)))
+    assert inside - 2 / (n + 1) <= forecast.probability <= inside + 1e-9  # sums of floats
     assert inside >= COVERAGE or (forecast.low, forecast.high) == (d.min(), d.max())
     if forecast.low < forecast.high:
         ends = min(counts[forecast.low], counts[forecast.high])
-        assert counts[forecast.low : forecast.high + 1].sum() - ends < COVERAGE * n or ends == 0
+        assert counts[forecast.low : forecast.high + 1].sum() - ends < COVERAGE * n + 1e-9 or ends == 0
 
 
 # a plant that latches and reports
@@ -605,7 +624,7 @@ def test_one_absurd_transit_among_others_costs_no_time_and_changes_no_forecast()
     loop.estimator.renew(loop.line())
     forecast = loop.forecast()
     assert forecast[:3] == (1, 1, 1)
-    assert forecast.probability == pytest.approx(100 / 102)
+    assert forecast.probability == pytest.approx(100 / 101)
 
 
 def test_a_stall_of_the_plant_is_no_property_of_the_link():
