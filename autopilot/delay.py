@@ -404,6 +404,12 @@ class DelayEstimator:
             else:
                 high += 1
                 covered += weights[high]
+        while low < best or best < high:  # with several humps more may have been taken than is needed
+            end = low if best == high or (low < best and weights[low] <= weights[high]) else high
+            if covered - weights[end] < enough:
+                break
+            covered -= weights[end]
+            low, high = (low + 1, high) if end == low else (low, high - 1)
         probability = min(self._most(law, age_ns, first + low, first + high), covered / total)
         return DelayEstimate(first + best, first + low, first + high, probability, self._status)
 
