@@ -13,7 +13,7 @@ from autopilot.clocksync import ClockSync
 from autopilot.config import AutopilotConfig
 from autopilot.control import SetChanges
 from autopilot.delay import DelayEstimator
-from autopilot.failsafe import FLOWN_BY_LAW, Event, FailsafeState, Mode
+from autopilot.failsafe import FLOWN_BY_FIRST_LAW, FLOWN_BY_LAW, Event, FailsafeState, Mode
 from autopilot.link.clock import NS_PER_MS, NS_PER_S, NS_PER_US, following
 from autopilot.link.node import Datagram, Record
 from autopilot.link.wire import (
@@ -279,7 +279,7 @@ class AutopilotNode:
         self._record_command(command)
         if command.sample.alpha is not self._alpha_told:
             self._tell_alpha(command)
-        if command.mode in (Mode.TRACKING, Mode.LEVEL):
+        if command.mode in FLOWN_BY_FIRST_LAW:
             self._tell_gain_set(command)
 
     def _tell_alpha(self, command: Command) -> None:

@@ -156,8 +156,6 @@ class DelayEstimator:
 
     def forget(self) -> None:
         """Drop all that is known: the plant's clock has stepped, or the plant is a new one."""
-        self.due = False
-        self.shift_ns = 0
         self._transits = Window(MAX_TRANSITS, 2)
         self._ages = Window(MAX_AGES, 2)
         self._reports = Window(MAX_REPORTS, 3)
@@ -165,17 +163,30 @@ class DelayEstimator:
         self._latched: dict[int, int] = {}
         self._last_request = (0, 0)
         self._levels: deque[float] = deque(maxlen=CHANGE_TRANSITS)
-        self._contradictions = self._in_a_row = 0
-        self._suspected = False
-        self._in_doubt = 0
-        self._since_suspicion = SHIFT_REPORTS
-        self._density = EVEN
         self._law: TransitLaw | None = None
         self._line = ClockLine(0, 0, 0.0)
         self._skew = 0.0
         self._fade_ns = 0.0
         self._status = DelayStatus.UNKNOWN
         self._heard_ns = self._transit_ns = 0
+        self._restart(0)
+
+    def _restart(self, transits: int) -> None:
+        """Keep the last transits only; nothing that was learnt from reports or ages before."""
+        self.shift_ns = 0
+        self._transits.keep(transits)
+        self._ages.keep(0)
+        self._reports.keep(0)
+        self._sent.clear()
+        self._levels.clear()
+        self._contradictions = self._in_a_row = 0
+        self._suspected = False
+        self._in_doubt = 0
+        self._since_suspicion = SHIFT_REPORTS
+        self._density = EVEN
+        self.due = transits >= MIN_TRANSITS
+        if transits < MIN_TRANSITS:
+            self._law = None
 
     # What comes in
 
@@ -330,23 +341,6 @@ class DelayEstimator:
         self._fade_ns = max(spread_ns / math.log(n + 1), self.Ts_ns * FADE_SHARE)
         self._status = DelayStatus.ESTIMATED if n >= MANY_TRANSITS else DelayStatus.CONVERGING
 
-    def _restart(self, transits: int) -> None:
-        """Keep the last transits only; nothing that was learnt from reports or ages before."""
-        self.shift_ns = 0
-        self._transits.keep(transits)
-        self._ages.keep(0)
-        self._reports.keep(0)
-        self._sent.clear()
-        self._levels.clear()
-        self._contradictions = self._in_a_row = 0
-        self._suspected = False
-        self._in_doubt = 0
-        self._since_suspicion = SHIFT_REPORTS
-        self._density = EVEN
-        self.due = transits >= MIN_TRANSITS
-        if transits < MIN_TRANSITS:
-            self._law = None
-
     def _offsets(self, t_ns: NDArray[np.int64]) -> NDArray[np.int64]:
         """Return the clock line at own times."""
         line = self._line
@@ -369,8 +363,7 @@ class DelayEstimator:
         law, Ts_ns = self._law, self.Ts_ns
         if law is None or now_ns - self._heard_ns > STALE_NS:
             return UNKNOWN
-        line = self._line
-        age_ns = now_ns + line.offset_ns + round((now_ns - line.t_ref_ns) * self._skew) - sample_ns
+        age_ns = self._age_ns(sample_ns, now_ns)
         transits, levels = law.transits, law.levels
         first = -(-(age_ns + transits[0]) // Ts_ns)
         last = -(-(age_ns + transits[-1]) // Ts_ns)

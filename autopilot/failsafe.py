@@ -20,6 +20,7 @@ from autopilot.link.clock import NS_PER_S
 
 __all__ = [
     "CALM_SAMPLES",
+    "FLOWN_BY_FIRST_LAW",
     "FLOWN_BY_LAW",
     "GOOD_SAMPLES",
     "REST_NS",
@@ -63,7 +64,9 @@ class Mode(_Word):
     NEUTRAL = "NEUTRAL", "The trim input."
 
 
-FLOWN_BY_LAW = frozenset({Mode.TRACKING, Mode.LEVEL, Mode.CONSERVATIVE})
+FLOWN_BY_FIRST_LAW = frozenset({Mode.TRACKING, Mode.LEVEL})
+"""The modes in which the gains themselves fly, not the conservative ones."""
+FLOWN_BY_LAW = FLOWN_BY_FIRST_LAW | {Mode.CONSERVATIVE}
 """The modes in which a law computes the command."""
 
 
@@ -145,6 +148,11 @@ class Limits:
     rest_ns: int = REST_NS
     conservative: bool = False
 
+    @property
+    def longest_row(self) -> int:
+        """The longest row that counts, samples."""
+        return max(self.good_samples, self.calm_samples)
+
 
 @dataclass(frozen=True, slots=True)
 class FailsafeState:
@@ -187,8 +195,7 @@ def step(state: FailsafeState, event: Event, now_ns: int, limits: Limits) -> Fai
     after SATURATED, are believed only when the time has really passed, so the caller may raise EXPIRED on every
     tick. A lost ground station is remembered: a change to TRACKING then goes on to LEVEL.
     """
-    longest = max(limits.good_samples, limits.calm_samples)
-    if event is Event.GOOD and state.mode is Mode.TRACKING and state.good_in_a_row == longest:
+    if event is Event.GOOD and state.mode is Mode.TRACKING and state.good_in_a_row == limits.longest_row:
         return state  # as nearly always, right between a packet in and a packet out
     if event is Event.WIDE and not limits.conservative:
         event = Event.OUTSIDE
@@ -214,7 +221,7 @@ def _rows(state: FailsafeState, event: Event, limits: Limits) -> tuple[int, int]
         return good, usable
     if event is Event.CLOCK_LOST:  # the samples before it were no GOOD ones any more, but WIDE ones
         return 0, usable
-    longest = max(limits.good_samples, limits.calm_samples)
+    longest = limits.longest_row
     good = min(good + 1, longest) if event is Event.GOOD else 0
     usable = min(usable + 1, longest) if event in (Event.GOOD, Event.WIDE) else 0
     return good, usable

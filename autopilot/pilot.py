@@ -17,7 +17,7 @@ import numpy as np
 from autopilot.config import AutopilotConfig
 from autopilot.control import ChosenSets, Law, SetChooser, law_of
 from autopilot.delay import DelayEstimate
-from autopilot.failsafe import FLOWN_BY_LAW, Event, FailsafeState, Limits, Mode, step
+from autopilot.failsafe import FLOWN_BY_FIRST_LAW, FLOWN_BY_LAW, Event, FailsafeState, Limits, Mode, step
 from autopilot.link.clock import NS_PER_S
 from autopilot.link.wire import Severity
 from autopilot.monitors import COMMAND_MEMORY, Plausibility, Saturation, Silence
@@ -109,6 +109,7 @@ class Pilot:
         self._tell = tell
         self._missing = missing
         self._Ts_ns = self.model.Ts_ns
+        self._longest_ahead = (gains if self.conservative is None else self.conservative).d_max + 1
         self._laws = [law_of(each) for each in self.sets]
         self._conservative_law = law_of(self.conservative) if self.conservative is not None else None
         self.travel = self._laws[0].travel
@@ -179,15 +180,14 @@ class Pilot:
 
     def sent(self, command: Command) -> None:
         """Take note of a command that has left; what follows from it alone could wait until now."""
-        if command.mode in (Mode.TRACKING, Mode.LEVEL):
+        if command.mode in FLOWN_BY_FIRST_LAW:
             self._chosen.note(command.sample.j, command.gain_set)
         self._plausibility.commanded(command.u)
         self._next_repeat_ns = command.at_ns + self._Ts_ns
         if event := self._saturation.told(command.saturated, command.at_ns):
             self.event(event, "elevator at its limit", command.at_ns)
         if self.reference is not None:  # what the next command will look ahead to
-            widest = self.config.gains if self.conservative is None else self.conservative
-            self.reference.ahead(widest.d_max + 1)
+            self.reference.ahead(self._longest_ahead)
 
     def _worth(self, sample: Sample, forecast: DelayEstimate, now_ns: int) -> tuple[Event, str]:
         """Return what a sample is to failsafe, and why."""
@@ -271,7 +271,7 @@ class Pilot:
         self._reported = (d, now_ns)
         in_window = _holds(self.config.gains, d)
         fits = in_window
-        if self.conservative is not None and self.mode not in (Mode.TRACKING, Mode.LEVEL):
+        if self.conservative is not None and self.mode not in FLOWN_BY_FIRST_LAW:
             fits = _holds(self.conservative, d)
         if not fits:
             self.event(Event.OUTSIDE, f"delay {d} reported", now_ns)

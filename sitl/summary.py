@@ -12,7 +12,7 @@ import numpy as np
 from rich.table import Table as Grid
 from rich.text import Text
 
-from autopilot.failsafe import Mode
+from autopilot.failsafe import FLOWN_BY_FIRST_LAW, Mode
 from gains.model import GainLaw
 from gains.verify import verified
 from sitl.flightdata import FlightData
@@ -195,7 +195,7 @@ def failsafe_reaction_samples(kept: Iterable[Kept], scenario: Scenario) -> float
     longest_ns = None
     for at_ns in outside_ns:
         following = bisect_left(changes, at_ns - SAME_INSTANT_NS, key=lambda change: change[0])
-        if following and changes[following - 1][1] in (Mode.TRACKING, Mode.LEVEL):
+        if following and changes[following - 1][1] in FLOWN_BY_FIRST_LAW:
             left_ns = changes[following][0] if following < len(changes) else end_ns
             longest_ns = max(longest_ns or 0, left_ns - at_ns)
     return None if longest_ns is None else longest_ns / scenario.plant.Ts_ns
