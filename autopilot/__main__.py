@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Literal
@@ -9,11 +11,15 @@ from typing import Literal
 import click
 
 from autopilot.alpha import AlphaChoice
-from autopilot.app import AutopilotConfig, AutopilotNode
+from autopilot.app import AutopilotNode
+from autopilot.config import AutopilotConfig, Home
+from autopilot.ground.parameterfile import ParameterFile
 from autopilot.link.clock import NS_PER_S, Clock
-from autopilot.link.process import ADDRESS, ProcessOptions, process_options, run_node
+from autopilot.link.keyring import CONTROL_LINK, Keyring, ground_link
+from autopilot.link.process import ADDRESS, Parsed, ProcessOptions, process_options, run_node
 from autopilot.link.udp import Address, dial
-from autopilot.reference import parse_profile
+from autopilot.link.wire import Seal
+from autopilot.profile import parse_profile
 from gains.command import FiniteRange, run, version
 from gains.model import Schedule
 from gains.store import load_law
@@ -22,6 +28,26 @@ from gains.table import InputError
 __all__ = ["main"]
 
 MAX_GROUND_STATIONS = 8
+
+
+def parse_home(text: str) -> Home:
+    """Return the place written as ``47.4,8.5,488``: degrees, and metres above the sea.
+
+    Raises
+    ------
+    InputError
+        For anything else.
+    """
+    try:
+        latitude, longitude, altitude = map(float, text.split(","))
+    except ValueError:
+        latitude = longitude = altitude = math.nan
+    if not (abs(latitude) <= 85.0 and abs(longitude) <= 180.0 and abs(altitude) <= 100_000.0):
+        raise InputError(f'home "{text}": expected LATITUDE,LONGITUDE,ALTITUDE such as 47.4,8.5,488')
+    return Home(latitude, longitude, altitude)
+
+
+HOME = Parsed("HOME", parse_home)
 
 
 @click.command(context_settings={"help_option_names": ["-h", "--help"]})
@@ -98,6 +124,29 @@ MAX_GROUND_STATIONS = 8
     show_default=True,
     help="Seconds without a ground station, once one was heard, until the reference is eased to zero; 0: never.",
 )
+@click.option("--wait-arm", is_flag=True, help="Leave arming to a ground station; else it arms itself, once.")
+@click.option(
+    "--alternative",
+    "alternatives",
+    multiple=True,
+    help="Gains that a ground station may choose instead (parameter GAINS); may be repeated.",
+)
+@click.option(
+    "--parameters",
+    "parameters_file",
+    type=click.Path(dir_okay=False, path_type=Path),
+    help="File of the parameters that ground stations have saved; they count before the options here.",
+)
+@click.option(
+    "--home", type=HOME, default="47.397742,8.545594,488", show_default=True, help="LATITUDE,LONGITUDE,ALTITUDE."
+)
+@click.option(
+    "--key",
+    "keys",
+    multiple=True,
+    help="PORT=FILE: sign a link with the key in a file; PORT is plant, gcs0, gcs1, ..., or gcs for all of these.",
+)
+@click.option("--accept-unsigned", "unsigned", multiple=True, help="A signed PORT that hears unsigned frames, too.")
 @click.option("--require-certificate", is_flag=True, help="Refuse gains without a verified certificate.")
 @process_options
 @click.version_option(version())
@@ -113,6 +162,12 @@ def cli(
     hold_s: float,
     saturation_s: float,
     ground_timeout_s: float,
+    wait_arm: bool,
+    alternatives: tuple[str, ...],
+    parameters_file: Path | None,
+    home: Home,
+    keys: tuple[str, ...],
+    unsigned: tuple[str, ...],
     require_certificate: bool,
     clock: Clock,
     record: Path | None,
@@ -127,6 +182,7 @@ def cli(
     stations = [ADDRESS.convert(text, None, None) for text in gcs if text != "none"]
     if len(stations) > MAX_GROUND_STATIONS:
         raise InputError(f"--gcs: expected at most {MAX_GROUND_STATIONS} ground stations, found {len(stations)}")
+    keyring = Keyring("autopilot", clock)
     config = AutopilotConfig(
         gains=gains,
         profile=parse_profile(reference, gains.model.Ts),
@@ -138,6 +194,11 @@ def cli(
         saturation_ns=round(saturation_s * NS_PER_S),
         ground_timeout_ns=round(ground_timeout_s * NS_PER_S),
         ground_stations=len(stations),
+        wait_arm=wait_arm,
+        alternatives=tuple(load_law(name) for name in alternatives),
+        home=home,
+        parameters=None if parameters_file is None else ParameterFile(parameters_file),
+        seals=_seals(keyring, keys, unsigned, len(stations)),
     )
     if isinstance(gains, Schedule) and gains.certificate is not None:  # of all switching: it may take half a minute
         click.echo(f"autopilot: checking the certificate of schedule {gains.name}", err=True)
@@ -159,7 +220,44 @@ def cli(
         )
     banner = f"autopilot: gains {gains.name} ({proved}){scheduled}{also}, plant {plant[0]}:{plant[1]}"
     metadata = {"program": "autopilot", "gains": gains.name, "version": version()}
-    run_node("autopilot", node, openers, ProcessOptions(clock, record, stream), metadata, tap=True, banner=banner)
+    options = ProcessOptions(clock, record, stream)
+    run_node("autopilot", node, openers, options, metadata, tap=True, banner=banner, keyring=keyring)
+
+
+def _seals(keyring: Keyring, keys: Sequence[str], unsigned: Sequence[str], stations: int) -> dict[str, Seal]:
+    """Return the signing of each port that has a key.
+
+    Raises
+    ------
+    InputError
+        For a port that is not there, or one that is to accept unsigned frames and has no key.
+    """
+    ground = [f"gcs{i}" for i in range(stations)]
+    files: dict[str, Path] = {}
+    for text in keys:
+        port, equals, name = text.partition("=")
+        if not equals or not name:
+            raise InputError(f'--key "{text}": expected PORT=FILE such as plant=plant.key')
+        files |= dict.fromkeys(_ports("--key", port, ground), Path(name))
+    open_ports = {each for port in unsigned for each in _ports("--accept-unsigned", port, ground)}
+    if keyless := sorted(open_ports - files.keys()):
+        raise InputError(f"--accept-unsigned {keyless[0]}: expected a port with a --key; one without hears everybody")
+    seals: dict[str, Seal] = {}
+    for port, path in files.items():
+        control = port == "plant"
+        link = CONTROL_LINK if control else ground_link(ground.index(port))
+        peer_link = CONTROL_LINK if control else None
+        seals[port] = keyring.seal(port, path, link, peer_link=peer_link, accept_unsigned=port in open_ports)
+    return seals
+
+
+def _ports(option: str, port: str, ground: Sequence[str]) -> Sequence[str]:
+    """Return the ports that a word stands for."""
+    if port == "gcs":
+        return ground
+    if port != "plant" and port not in ground:
+        raise InputError(f"{option} {port}: expected plant, gcs, or one of {', '.join(ground) or 'no ground station'}")
+    return [port]
 
 
 def main() -> None:

@@ -6,16 +6,22 @@ forecast, and only then the first heartbeat goes to the plant, whose clockwork s
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 
 from autopilot.alpha import AlphaSource
 from autopilot.clocksync import ClockSync
+from autopilot.commander import ATTITUDE_IGNORE, Commander
 from autopilot.config import AutopilotConfig
 from autopilot.control import SetChanges
 from autopilot.delay import DelayEstimator
 from autopilot.failsafe import FLOWN_BY_FIRST_LAW, FLOWN_BY_LAW, Event, FailsafeState, Mode
+from autopilot.ground.settings import Settings
+from autopilot.ground.vehicle import Vehicle, banner
 from autopilot.link.clock import NS_PER_MS, NS_PER_S, NS_PER_US, following
+from autopilot.link.groundmessages import AttitudeTarget
 from autopilot.link.node import Datagram, Record
+from autopilot.link.sensors import pitch_index
 from autopilot.link.wire import (
     AUTOPILOT,
     PLANT,
@@ -35,10 +41,10 @@ from autopilot.monitors import Halves
 from autopilot.pilot import Command, Notice, Pilot
 from autopilot.state import JUMP_BACK_NS, Drop, Sample, SampleAssembler
 from autopilot.telemetry import DelayTelemetry
-from autopilot.vehicle import Vehicle, banner
-from gains.verify import verified
+from gains.model import GainLaw
+from gains.verify import Verification, verified
 
-__all__ = ["AutopilotConfig", "AutopilotNode"]
+__all__ = ["AutopilotNode"]
 
 PLANT_PORT = "plant"
 HEARTBEAT_NS = NS_PER_S
@@ -47,6 +53,8 @@ TIMESYNC_NS = 100 * NS_PER_MS
 SYNC_WAIT_NS = 2 * NS_PER_S
 """A plant that answers no TIMESYNC gets its heartbeat after this time all the same."""
 COUNTERS_NS = NS_PER_S
+RATES_AND_THRUST_IGNORE = 1 | 2 | 4 | 64
+"""ATTITUDE_TARGET_TYPEMASK: body rates and thrust are not meant."""
 HALF_NS = NS_PER_S
 """Half of the state may be missing for so long before that is said."""
 
@@ -63,31 +71,50 @@ class AutopilotNode:
     def __init__(self, config: AutopilotConfig) -> None:
         self.config = config
         self.model = config.gains.model
-        self.proof = verified(config.gains)
-        self.conservative_proof = None if config.gains.conservative is None else verified(config.gains.conservative)
-        self.wire = Wire(AUTOPILOT, PLANT)
+        self.proof, self.conservative_proof = _proofs(config.gains)
+        self.wire = Wire(AUTOPILOT, PLANT, seal=config.seals.get(PLANT_PORT))
         self.clock = ClockSync()
         self.delay = DelayEstimator(self.model.Ts_ns)
         self.samples = SampleAssembler(self.model, config.alpha)
         self.halves = Halves(self.samples.needed)
-        self.pilot = Pilot(config, self._notice, self._missing_half)
+        self._pitch_index = pitch_index(self.model)
+        self._trim_pitch = 0.0 if self._pitch_index is None else float(self.model.trim.x[self._pitch_index])
+        self.commander = Commander(self._unready, self._commanded, self._trim_pitch, self_arm=not config.wait_arm)
+        self.pilot = Pilot(config, self.commander, self._notice, self._missing_half)
         self.gain_set_changes = SetChanges()
         self.telemetry = DelayTelemetry()
         self.epoch = 0
+        self._out: list[Datagram] = []
+        self._records: list[Record] = []
+        ports = tuple(f"gcs{i}" for i in range(config.ground_stations))
+        self._started_ns: int | None = None
+        self.settings = Settings(
+            (config.gains, *config.alternatives),
+            verified,
+            self.pilot,
+            self.commander,
+            ports,
+            self._gains_changed,
+            config.parameters,
+        )
         self.vehicle = Vehicle(
-            tuple(f"gcs{i}" for i in range(config.ground_stations)),
-            banner(config.gains, self.proof, self.conservative_proof),
+            ports,
+            banner(self.pilot.gains, self.proof, self.conservative_proof),
+            self.commander,
+            self.settings.parameters,
+            self.settings,
+            config.home,
+            {AttitudeTarget: self._attitude_target},
+            config.seals,
         )
         self._steps_seen = 0
         self._alpha_told: AlphaSource | None = None
         self._half_told: str | None = None
-        self._started_ns: int | None = None
+        self._told: Command | None = None
         self._next_heartbeat_ns: int | None = None
         self._next_timesync_ns: int | None = None
         self._next_counters_ns: int | None = None
         self._untold: list[Command] = []
-        self._out: list[Datagram] = []
-        self._records: list[Record] = []
 
     @property
     def windows(self) -> list[tuple[int, int]]:
@@ -103,8 +130,9 @@ class AutopilotNode:
 
     def receive(self, port: str, datagram: bytes, now_ns: int) -> None:
         """Take one datagram from the plant or from a ground station."""
+        self._tell_time(now_ns)
         if port != PLANT_PORT:
-            if self.vehicle.receive(port, datagram):
+            if self.vehicle.receive(port, datagram, now_ns):
                 self.pilot.heard_ground(now_ns)
             return
         for message in self.wire.decode(datagram):
@@ -123,6 +151,7 @@ class AutopilotNode:
 
     def tick(self, now_ns: int) -> None:
         """Send what is due by time alone: TIMESYNC, heartbeats, failsafe's deadlines, telemetry."""
+        self._tell_time(now_ns)
         if self._started_ns is None:
             self._started_ns = self._next_timesync_ns = self._next_counters_ns = now_ns
             self._announce_gains(now_ns)
@@ -130,6 +159,7 @@ class AutopilotNode:
         for command in untold:
             self.pilot.sent(command)
             self._tell(command)
+            self._told = command
         self._renew_delay(now_ns)
         self._tick_plant_link(now_ns)
         last = self.pilot.last
@@ -137,9 +167,8 @@ class AutopilotNode:
             self.delay.repeated(last.j)
             self._send_command(last)
         self._tick_telemetry(now_ns)
-        mode = self.pilot.mode
-        degraded = mode not in (Mode.TRACKING, Mode.STANDBY)
-        self.vehicle.tick(now_ns, tracking=mode in FLOWN_BY_LAW, degraded=degraded)
+        self.commander.tick(now_ns)
+        self.vehicle.tick(now_ns, degraded=self._degraded)
         assert self._next_counters_ns is not None
         if now_ns >= self._next_counters_ns:
             self._next_counters_ns = following(self._next_counters_ns, COUNTERS_NS, now_ns)
@@ -157,6 +186,7 @@ class AutopilotNode:
             self._next_counters_ns,
             self.pilot.next_deadline_ns(),
             self.telemetry.next_deadline_ns(),
+            self.commander.next_deadline_ns(),
             self.vehicle.next_deadline_ns(),
         ):
             if due_ns is not None and due_ns < earliest_ns:
@@ -172,6 +202,10 @@ class AutopilotNode:
         """Take away the records."""
         records, self._records = self._records, []
         return records
+
+    def _tell_time(self, now_ns: int) -> None:
+        for seal in self.config.seals.values():
+            seal.tick(now_ns)
 
     # The plant's messages
 
@@ -323,7 +357,9 @@ class AutopilotNode:
             self._send(Timesync(0, self.clock.request(now_ns)))
         if self._next_heartbeat_ns is not None and now_ns >= self._next_heartbeat_ns:
             self._next_heartbeat_ns = following(self._next_heartbeat_ns, HEARTBEAT_NS, now_ns)
-            self._send(autopilot_heartbeat(tracking=self.pilot.mode in FLOWN_BY_LAW, degraded=False))
+            mode = self.commander.mode
+            beat = autopilot_heartbeat(armed=self.commander.armed, custom_mode=mode, flags=mode.flags, degraded=False)
+            self._send(beat)
 
     def _tick_telemetry(self, now_ns: int) -> None:
         """Show and record the statistics of delay and clocks when they are due."""
@@ -338,7 +374,7 @@ class AutopilotNode:
         self._out.append((PLANT_PORT, self.wire.encode(message)))
 
     def _announce_gains(self, now_ns: int) -> None:
-        gains, proof = self.config.gains, self.proof
+        gains, proof = self.pilot.gains, self.proof
         data = {"gains": gains.name, "d_min": gains.d_min, "d_max": gains.d_max, "windows": self.windows}
         data |= {"verified": proof.passed, "reason": proof.reason}
         wide, wide_proof = gains.conservative, self.conservative_proof
@@ -346,6 +382,43 @@ class AutopilotNode:
             window = {"d_min": wide.d_min, "d_max": wide.d_max}
             data["conservative"] = {"gains": wide.name, **window, "verified": wide_proof.passed}
         self._event("gains", self.vehicle.banner[0].text, now_ns, data)
+
+    def _gains_changed(self, gains: GainLaw, now_ns: int) -> None:
+        """Take note of other gains; say so when that is in flight."""
+        self.proof, self.conservative_proof = _proofs(gains)
+        self.gain_set_changes = SetChanges()
+        if self._started_ns is None:
+            return  # chosen by the parameters on disk; told at start
+        self.vehicle.banner = banner(gains, self.proof, self.conservative_proof)
+        for text in self.vehicle.banner:
+            self.vehicle.say(text.severity, text.text)
+        self._announce_gains(now_ns)
+
+    @property
+    def _degraded(self) -> bool:
+        """Whether failsafe has the elevator, or flies with less than is asked for."""
+        return self.commander.engaged and self.pilot.mode not in (Mode.TRACKING, Mode.STANDBY)
+
+    def _unready(self, now_ns: int) -> list[str]:
+        """Return what keeps the law from flying now."""
+        return self.pilot.unready(now_ns)
+
+    def _commanded(self, severity: int, text: str, now_ns: int) -> None:
+        """Tell of what the ground has asked for, or has stopped to ask for."""
+        self.vehicle.say(severity, text)
+        data = {"armed": self.commander.armed, "flight_mode": self.commander.mode.name}
+        self._event("commander", text, now_ns, data)
+
+    def _attitude_target(self, now_ns: int) -> AttitudeTarget:
+        """Return ATTITUDE_TARGET: the pitch reference that is flown now; no attitude while no law flies."""
+        command, mask = self._told, RATES_AND_THRUST_IGNORE
+        pitch = self._trim_pitch
+        if command is not None and command.mode in FLOWN_BY_LAW and self._pitch_index is not None:
+            pitch += command.r
+        else:
+            mask |= ATTITUDE_IGNORE
+        q = (math.cos(pitch / 2), 0.0, math.sin(pitch / 2), 0.0)
+        return AttitudeTarget(now_ns // NS_PER_MS, mask, q, 0.0, 0.0, 0.0, 0.0)
 
     def _notice(self, notice: Notice) -> None:
         """Tell of a change of mode."""
@@ -364,7 +437,7 @@ class AutopilotNode:
             "epoch": self.epoch,
             "x": sample.x,
             "xr": xr or None,
-            "r": [self.config.profile.r(sample.j)] if xr else None,
+            "r": [command.r] if xr else None,
             "u": [command.u],
             "saturated": command.saturated,
             "d": forecast.d,
@@ -373,6 +446,8 @@ class AutopilotNode:
             "d_probability": forecast.probability,
             "status": forecast.status,
             "mode": command.mode,
+            "flight_mode": command.flight_mode.name,
+            "armed": command.armed,
             "gain_set": command.gain_set,
             "alpha": sample.alpha,
         }
@@ -387,8 +462,15 @@ class AutopilotNode:
             "timesync_contradictions": self.clock.contradictions,
             "ground": {port: {k.value: n for k, n in w.rejects.items()} for port, w in self.vehicle.wires.items()},
             "telemetry_refused": self.vehicle.refused,
+            "ground_elsewhere": self.vehicle.elsewhere,
+            "setpoints_refused": self.commander.refused,
             "gain_set_changes": self.gain_set_changes.total,
             "clock": clock.status,
             "clock_bound_ns": clock.bound_ns,
         }
         self._event("counters", "autopilot counters", now_ns, data)
+
+
+def _proofs(gains: GainLaw) -> tuple[Verification, Verification | None]:
+    """Return the verification of a law, and of its conservative gains if there are some."""
+    return verified(gains), None if gains.conservative is None else verified(gains.conservative)

@@ -2,16 +2,42 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Literal, Protocol
 
 from autopilot.alpha import AlphaChoice
 from autopilot.link.clock import NS_PER_S
+from autopilot.link.wire import Seal
 from autopilot.monitors import SATURATION_NS
-from autopilot.reference import Profile
+from autopilot.profile import Profile, Source
 from gains.model import GainLaw
+from gains.table import Table
 
-__all__ = ["AutopilotConfig"]
+__all__ = ["ZURICH", "AutopilotConfig", "Home", "ParameterStore"]
+
+
+@dataclass(frozen=True, slots=True)
+class Home:
+    """Where the flight begins on the map: degrees, and metres above the sea."""
+
+    latitude_deg: float
+    longitude_deg: float
+    altitude_m: float
+
+
+ZURICH = Home(47.397742, 8.545594, 488.0)
+"""Where simulated aircraft of the field often begin."""
+
+
+class ParameterStore(Protocol):
+    """Where parameters are kept."""
+
+    def read(self) -> Table | None:
+        """Return what is kept; None for nothing."""
+
+    def write(self, values: Mapping[str, object]) -> None:
+        """Keep values, all of them or none; OSError when that is not possible."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,8 +48,8 @@ class AutopilotConfig:
     ----------
     gains : Gains or Schedule
         K1 and K2 with their windows, and the model; the conservative gains too, if the file names some.
-    profile : Profile
-        The programmed reference.
+    profile : Source
+        The programmed reference, flown in AUTO.
     actuator : "pwm" or "float"
         SERVO_OUTPUT_RAW or HIL_ACTUATOR_CONTROLS to the plant.
     failsafe : "on" or "monitor"
@@ -40,10 +66,20 @@ class AutopilotConfig:
         Silence of all ground stations that counts as a loss, once one was heard; 0 for none.
     ground_stations : int
         Number of ports gcs0, gcs1, ...
+    wait_arm : bool
+        Whether arming is left to the ground; else the vehicle arms itself once, when the checks pass.
+    alternatives : tuple of GainLaw
+        Laws for the same model that a ground station may choose instead.
+    home : Home
+        Where the map begins.
+    parameters : ParameterStore or None
+        Where parameters are kept; what is there counts from the start.
+    seals : mapping
+        Port to what signs and checks its frames; a port that is missing is not signed.
     """
 
     gains: GainLaw
-    profile: Profile = field(default_factory=Profile)
+    profile: Source = field(default_factory=Profile)
     actuator: Literal["pwm", "float"] = "pwm"
     failsafe: Literal["on", "monitor"] = "on"
     alpha: AlphaChoice = "auto"
@@ -52,3 +88,8 @@ class AutopilotConfig:
     saturation_ns: int = SATURATION_NS
     ground_timeout_ns: int = 0
     ground_stations: int = 1
+    wait_arm: bool = False
+    alternatives: tuple[GainLaw, ...] = ()
+    home: Home = ZURICH
+    parameters: ParameterStore | None = None
+    seals: Mapping[str, Seal] = field(default_factory=dict)

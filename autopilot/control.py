@@ -65,15 +65,22 @@ class Law:
         return u, u != wanted
 
 
-def law_of(gains: Gains) -> Law:
+def law_of(gains: Gains, travel: Travel | None = None) -> Law:
     """Return the law of a set of gains.
+
+    Parameters
+    ----------
+    gains : Gains
+        The gains.
+    travel : Travel, optional
+        The elevator's; else the model's.
 
     Raises
     ------
     InputError
         When the model has not exactly one input with limits.
     """
-    travel = travel_of(gains.model)
+    travel = travel_of(gains.model) if travel is None else travel
     K2 = () if gains.K2 is None else tuple(gains.K2[0].tolist())
     return Law(tuple(gains.K1[0].tolist()), K2, tuple(gains.model.trim.x.tolist()), travel)
 

@@ -56,7 +56,10 @@ class _Word(StrEnum):
 class Mode(_Word):
     """Who has the elevator; ``meaning`` says it in words."""
 
-    STANDBY = "STANDBY", "Nobody yet: neutral until the first good sample."
+    STANDBY = (
+        "STANDBY",
+        "No law: neutral until the vehicle is armed and the first good sample comes, or the stick in MANUAL.",
+    )
     TRACKING = "TRACKING", "The control law."
     LEVEL = "LEVEL", "The control law with its reference eased to zero: the ground station is lost."
     CONSERVATIVE = "CONSERVATIVE", "The second set of gains, certified for a wider window of delays."
@@ -89,6 +92,7 @@ class Event(_Word):
     GROUND_BACK = "ground_back", "The ground station is heard again."
     EXPIRED = "expired", "HOLD has lasted its time."
     RESTARTED = "restarted", "The plant has started anew."
+    RELEASED = "released", "The vehicle is disarmed, or flown by hand."
 
 
 def _same(modes: tuple[Mode, ...], events: tuple[Event, ...], to: Mode) -> dict[tuple[Mode, Event], Mode]:
@@ -112,7 +116,7 @@ TRANSITIONS: Mapping[tuple[Mode, Event], Mode] = {
     **_same((Mode.HOLD,), (Event.EXPIRED,), Mode.NEUTRAL),
     # the last command is the saturated one: no HOLD
     **_same((Mode.TRACKING, Mode.LEVEL, Mode.CONSERVATIVE, Mode.HOLD), (Event.SATURATED,), Mode.NEUTRAL),
-    **_same(tuple(mode for mode in Mode if mode is not Mode.STANDBY), (Event.RESTARTED,), Mode.STANDBY),
+    **_same(tuple(mode for mode in Mode if mode is not Mode.STANDBY), (Event.RESTARTED, Event.RELEASED), Mode.STANDBY),
 }
 """(mode, event) -> next mode; every pair that is not here stays in its mode."""
 

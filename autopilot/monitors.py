@@ -13,6 +13,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from operator import mul
+from typing import NamedTuple
 
 from autopilot.failsafe import Event
 from autopilot.link.clock import NS_PER_S
@@ -79,6 +80,18 @@ class Verdict:
     reason: str
 
 
+class _Change(NamedTuple):
+    """What the model says of a row up to sample j: its first state, its steps, the change of each state.
+
+    The changes are pairs, with the least and with the greatest of the commands that may be in force.
+    """
+
+    j: int
+    first: Sequence[float]
+    steps: int
+    by_model: list[tuple[float, float]]
+
+
 class Plausibility:
     """Tells samples that no aircraft can have sent, and values that stand still although they must move.
 
@@ -106,6 +119,9 @@ class Plausibility:
     flight: a pitch angle when the pitch rate moves, all states together when the elevator is commanded away from
     where they would rest. A simulator without any noise, at rest in a steady wind of more than 2 deg/s that the
     model does not know, would be called frozen.
+
+    Where the next sample may have to be held against the model, what the model says of it is computed with the
+    command before it, as :meth:`commanded` is called when that has left, and :meth:`judge` while one waits.
 
     Parameters
     ----------
@@ -135,6 +151,8 @@ class Plausibility:
         self._stuck: list[str | None] = [None] * model.nx
         self._fitted = [0] * model.nx
         self._plausible: tuple[int, Sequence[float]] | None = None
+        self._next: _Change | None = None
+        """What the model says of the next sample, where that has stood still."""
         self.forget()
 
     def forget(self) -> None:
@@ -145,10 +163,13 @@ class Plausibility:
         self._stuck = [None] * len(self._stuck)
         self._fitted = [0] * len(self._fitted)
         self._plausible = None
+        self._next = None
 
     def commanded(self, u: float) -> None:
         """Take a command as it was sent, absolute, in units of u; every one of them, also neutral."""
         self._u.append(u)
+        if max(self._same) >= FROZEN_SAMPLES - 1:
+            self._next = self._change(self._row, self._row[-1][0] + 1)
 
     def judge(self, j: int, x: Sequence[float]) -> Verdict | None:
         """Return what is wrong with sample j, or None. A number that does not rise begins anew.
@@ -197,19 +218,21 @@ class Plausibility:
                     self._same[i] += 1
                 else:
                     self._same[i], self._stuck[i] = 0, None
-            if max(self._same) >= FROZEN_SAMPLES:
-                self._find_stuck(j, x)
+        still = max(self._same) >= FROZEN_SAMPLES
+        if still:
+            self._find_stuck(j, x)
         self._row.append((j, x))
-        stuck = next(filter(None, self._stuck), None)
+        self._next = None
+        stuck = next(filter(None, self._stuck), None) if still else None
         return None if stuck is None else Verdict(Event.FROZEN, stuck)
 
     def _find_stuck(self, j: int, x: Sequence[float]) -> None:
         """Note each state that has stood still over a row that does not fit the model; clear one when it long did."""
         still = [n for n, same in enumerate(self._same) if same >= FROZEN_SAMPLES]
-        row = [*self._row, (j, x)]
-        missed = self._missed(row)
+        ready = self._next
+        missed = _missed(ready if ready is not None and ready.j == j else self._change(self._row, j), x)
         if any(missed[i] > FROZEN_CHANGE for n in still for i in self._moved[n]):
-            missed = self._missed_by_all(row)
+            missed = self._missed_by_all([*self._row, (j, x)], missed)
         for n in still:
             i = max(self._moved[n], key=missed.__getitem__)
             if missed[i] <= FROZEN_CHANGE:
@@ -222,29 +245,45 @@ class Plausibility:
                 off = f"{self._names[i]} off by {missed[i]:.2g} > {FROZEN_CHANGE:.2g}"
                 self._stuck[n] = f"{self._names[n]} frozen at {x[n]:.3g}, {off}"
 
-    def _missed_by_all(self, row: Sequence[tuple[int, Sequence[float]]]) -> list[float]:
-        """Return by how much each state misses the model's change at the least, with any one sample left out."""
-        without = (self._missed([*row[:k], *row[k + 1 :]]) for k in range(len(row)))
-        return [min(each) for each in zip(*without, strict=True)]
+    def _missed_by_all(self, row: Sequence[tuple[int, Sequence[float]]], whole: list[float]) -> list[float]:
+        """Return by how much each state misses the model's change at the least, with any one sample left out.
 
-    def _missed(self, row: Sequence[tuple[int, Sequence[float]]]) -> list[float]:
-        """Return by how much each state's change over a row misses the model's, at the least, per FROZEN_SAMPLES.
-
-        Over lost samples the one before stands for them.
+        Parameters
+        ----------
+        row : sequence of (j, x)
+            The samples.
+        whole : list of float, length nx
+            By how much each state misses over all of them; as much as without a sample that only repeats the one
+            before, which would stand for it.
         """
+        (last, now), (second_last, before) = row[-1], row[-2]
+        missed = [_missed(self._change(row[:-2], second_last), before)]
+        for k, (_, x) in enumerate(row[:-1]):
+            repeats = k > 0 and x == row[k - 1][1]
+            missed.append(whole if repeats else _missed(self._change([*row[:k], *row[k + 1 : -1]], last), now))
+        return [min(each) for each in zip(*missed, strict=True)]
+
+    def _change(self, row: Iterable[tuple[int, Sequence[float]]], j: int) -> _Change:
+        """Return what the model says of a row up to sample j; over lost samples the one before stands for them."""
         numbers, states = zip(*row, strict=True)
-        spans = [after - before for before, after in pairwise(numbers)]
-        steps = numbers[-1] - numbers[0]
-        columns = zip(*states[:-1], strict=True)
+        spans = [after - before for before, after in pairwise([*numbers, j])]
+        steps = j - numbers[0]
+        columns = zip(*states, strict=True)
         dx = [sum(map(mul, spans, values)) - steps * trim for values, trim in zip(columns, self._trim, strict=True)]
         low, high = steps * (min(self._u) - self._neutral), steps * (max(self._u) - self._neutral)
-        missed = []
-        for A, B, before, now in zip(self._A, self._B, states[0], states[-1], strict=True):
-            rest = sum(map(mul, A, dx)) - (now - before)
-            one, other = rest + B * low, rest + B * high
-            least = 0.0 if one * other <= 0.0 else min(abs(one), abs(other))
-            missed.append(least * FROZEN_SAMPLES / steps)
-        return missed
+        free = [sum(map(mul, A, dx)) for A in self._A]
+        by_model = [(rest + B * low, rest + B * high) for rest, B in zip(free, self._B, strict=True)]
+        return _Change(j, states[0], steps, by_model)
+
+
+def _missed(change: _Change, x: Sequence[float]) -> list[float]:
+    """Return by how much each state's change up to x misses the model's, at the least, per FROZEN_SAMPLES."""
+    missed = []
+    for (one, other), before, now in zip(change.by_model, change.first, x, strict=True):
+        off, also = one - (now - before), other - (now - before)
+        least = 0.0 if off * also <= 0.0 else min(abs(off), abs(also))
+        missed.append(least * FROZEN_SAMPLES / change.steps)
+    return missed
 
 
 def _moved(model: Model) -> list[list[int]]:

@@ -1,36 +1,48 @@
 """Who flies, and what leaves: from a sample and the forecast of its command's delay to the command.
 
 Per sample: what the sample is worth to failsafe, which set of gains its forecast chooses, the reference at the
-expected instant of application, and the input of the law in force, or the one held, or neutral. Between samples:
-what follows from silence. The rules are elsewhere (``failsafe.py``, ``monitors.py``, ``control.py``,
-``reference.py``); this is their order.
+expected instant of application, and the input of the law in force, or the one held, or the stick's, or neutral.
+Between samples: what follows from silence. The rules are elsewhere (``commander.py``, ``failsafe.py``,
+``monitors.py``, ``control.py``, ``reference.py``); this is their order.
 """
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 
+from autopilot.commander import Commander, FlightMode, Moving, Programmed, Steady, Target
 from autopilot.config import AutopilotConfig
 from autopilot.control import ChosenSets, Law, SetChooser, law_of
 from autopilot.delay import DelayEstimate
 from autopilot.failsafe import FLOWN_BY_FIRST_LAW, FLOWN_BY_LAW, Event, FailsafeState, Limits, Mode, step
 from autopilot.link.clock import NS_PER_S
+from autopilot.link.sensors import pitch_index
+from autopilot.link.servo import Travel, travel_of
 from autopilot.link.wire import Severity
 from autopilot.monitors import COMMAND_MEMORY, Plausibility, Saturation, Silence
-from autopilot.reference import Profile, ReferenceModel, match_reference
+from autopilot.profile import Shifted
+from autopilot.reference import ReferenceModel, match_reference
 from autopilot.state import Sample
-from gains.model import GainLaw, Gains, sets_of
+from autopilot.streamed import Streamed
+from gains.model import GainLaw, Gains, Model, sets_of
 
 __all__ = ["Command", "Notice", "Pilot"]
 
 MAX_AHEAD = 200
 """Samples beyond the windows that the reference is looked ahead, whatever delay a peer makes us believe in."""
+CLOCK_UNKNOWN = "plant clock unknown"
 REPORT_NS = NS_PER_S
 """A delay that was reported longer ago says nothing about now."""
+
+_USABLE = (Event.GOOD, Event.WIDE)
+"""The samples that some law may fly on."""
+_TRIM = Steady()
+_NO_LIMITS = (-sys.float_info.max, sys.float_info.max)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -55,6 +67,12 @@ class Command:
         Who made it.
     gain_set : int
         Index of the schedule's set in force; the number of sets where the conservative gains fly.
+    r : float
+        The reference input of its sample, r(j); 0 without a reference.
+    flight_mode : FlightMode
+        What the ground has asked for.
+    armed : bool
+        Whether the elevator might leave neutral.
     """
 
     at_ns: int
@@ -65,6 +83,9 @@ class Command:
     saturated: bool
     mode: Mode
     gain_set: int
+    r: float
+    flight_mode: FlightMode
+    armed: bool
 
 
 class Notice(NamedTuple):
@@ -83,10 +104,23 @@ class Pilot:
     ----------
     config : AutopilotConfig
         What flies.
+    commander : Commander
+        What the ground has asked for.
     tell : callable
         Takes a Notice of each change of mode.
     missing : callable
         Says which half of the state has not come since a time (:meth:`autopilot.monitors.Halves.missing`).
+
+    Attributes
+    ----------
+    gains : Gains or Schedule
+        The law.
+    window : (int, int)
+        Delays, samples, in which the law may fly; within the window of its gains.
+    travel : Travel
+        The elevator's travel, with its stops.
+    max_pitch, max_rate : float or None
+        Largest pitch reference from trim, rad, and its fastest change, rad per sample; None for no limit.
 
     Raises
     ------
@@ -95,35 +129,62 @@ class Pilot:
     """
 
     def __init__(
-        self, config: AutopilotConfig, tell: Callable[[Notice], None], missing: Callable[[int], str | None]
+        self,
+        config: AutopilotConfig,
+        commander: Commander,
+        tell: Callable[[Notice], None],
+        missing: Callable[[int], str | None],
     ) -> None:
-        gains = config.gains
         self.config = config
-        self.model = gains.model
-        self.sets = sets_of(gains)
-        self.windows = [(each.d_min, each.d_max) for each in self.sets]
-        self.conservative: Gains | None = gains.conservative
+        self.model = config.gains.model
         self.failsafe = FailsafeState()
-        self.limits = Limits(config.hold_ns, conservative=self.conservative is not None)
+        self.limits = Limits(config.hold_ns)
         self.ground = Silence(config.ground_timeout_ns)
+        self.saturation = Saturation(config.saturation_ns)
+        self.travel = travel_of(self.model)
+        self.max_pitch: float | None = None
+        self.max_rate: float | None = None
+        self._commander = commander
         self._tell = tell
         self._missing = missing
         self._Ts_ns = self.model.Ts_ns
-        self._longest_ahead = (gains if self.conservative is None else self.conservative).d_max + 1
-        self._laws = [law_of(each) for each in self.sets]
-        self._conservative_law = law_of(self.conservative) if self.conservative is not None else None
-        self.travel = self._laws[0].travel
-        self._plausibility = Plausibility(self.model, max(COMMAND_MEMORY, gains.d_max))
-        self._saturation = Saturation(config.saturation_ns)
+        self._sense = elevator_sense(self.model)
+        self.use(config.gains)
         self.restart()
+
+    def use(self, gains: GainLaw) -> None:
+        """Fly other gains, for the same model, from the next sample on; the window becomes theirs."""
+        self.gains = gains
+        self.sets = sets_of(gains)
+        self.windows = [(each.d_min, each.d_max) for each in self.sets]
+        self.window = gains.d_min, gains.d_max
+        self.conservative: Gains | None = gains.conservative
+        self.limits = replace(self.limits, conservative=self.conservative is not None)
+        self.chooser = SetChooser(self.windows)
+        self._chosen = ChosenSets(self.windows)
+        self._plausibility = Plausibility(self.model, max(COMMAND_MEMORY, gains.d_max))
+        self._law_changed = True
+        self.set_travel(self.travel)
+
+    def set_travel(self, travel: Travel) -> None:
+        """Give the elevator other stops."""
+        self.travel = travel
+        self._laws = [law_of(each, travel) for each in self.sets]
+        self._conservative_law = law_of(self.conservative, travel) if self.conservative is not None else None
 
     def restart(self) -> None:
         """Begin a new epoch of the plant: nothing measured yet, the elevator neutral, the reference at rest."""
-        self.reference = self._new_reference()
+        self._source = Streamed()
+        self.reference = None if self.model.reference is None else ReferenceModel(self.model.reference, self._source)
+        self._target: Target | None = None
+        self._program: tuple[Programmed, int] | None = None
+        self._ahead = 0
+        self._idle = self._law_changed = False
+        self._worth_last: tuple[Event, str] | None = None
         self.chooser = SetChooser(self.windows)
         self._chosen = ChosenSets(self.windows)
         self._plausibility.forget()
-        self._saturation.told(saturated=False, now_ns=0)
+        self.saturation.told(saturated=False, now_ns=0)
         self._u, self._saturated = self.travel.neutral, False
         self._last: Sample | None = None
         self._first_j: int | None = None
@@ -131,7 +192,6 @@ class Pilot:
         self._next_repeat_ns: int | None = None
         self._reported: tuple[int, int] | None = None
         self._clock_known = False
-        self._eased = False
 
     @property
     def mode(self) -> Mode:
@@ -167,16 +227,31 @@ class Pilot:
         self._fresh_ns, self._last, self._clock_known = now_ns, sample, clock_known
         if self._first_j is None:
             self._first_j = sample.j
-        event, reason = self._worth(sample, forecast, now_ns)
-        self.event(event, reason, now_ns)
+        engaged = self._engage(*self._worth(sample, forecast, now_ns), now_ns)
         chosen = self.chooser.choose(forecast.d, forecast.low, forecast.high)
         law, gains, gain_set = self._in_force(chosen)
-        xr = self._look(sample, forecast, gains, was)
-        if law is not None:
+        xr, r = self._look(sample, forecast, gains, was)
+        if not engaged:
+            self._u, self._saturated = self._stick_u(), False
+        elif law is not None:
             self._u, self._saturated = law.command(sample.x, xr)
         elif self.mode is not Mode.HOLD:
             self._u, self._saturated = self.travel.neutral, False
-        return Command(now_ns, sample, forecast, xr, self._u, self._saturated, self.mode, gain_set)
+        self._idle = not engaged
+        commander = self._commander
+        return Command(
+            now_ns,
+            sample,
+            forecast,
+            xr,
+            self._u,
+            self._saturated,
+            self.mode,
+            gain_set,
+            r,
+            commander.mode,
+            commander.armed,
+        )
 
     def sent(self, command: Command) -> None:
         """Take note of a command that has left; what follows from it alone could wait until now."""
@@ -184,10 +259,43 @@ class Pilot:
             self._chosen.note(command.sample.j, command.gain_set)
         self._plausibility.commanded(command.u)
         self._next_repeat_ns = command.at_ns + self._Ts_ns
-        if event := self._saturation.told(command.saturated, command.at_ns):
+        if event := self.saturation.told(command.saturated, command.at_ns):
             self.event(event, "elevator at its limit", command.at_ns)
-        if self.reference is not None:  # what the next command will look ahead to
-            self.reference.ahead(self._longest_ahead)
+        if self.reference is not None:  # what the next command will most likely look ahead to
+            self.reference.ahead(self._ahead + 1)
+            self._source.forget(self.reference.k)
+
+    def _engage(self, event: Event, reason: str, now_ns: int) -> bool:
+        """Let failsafe take what a sample is worth, where the law is to fly; return whether it is."""
+        self._worth_last = event, reason
+        if event in _USABLE or self.config.failsafe == "monitor":
+            self._commander.usable_sample(now_ns)
+        if self._commander.engaged:
+            self.event(event, reason, now_ns)
+            return True
+        self._release(now_ns)
+        return False
+
+    def _release(self, now_ns: int) -> None:
+        """Take the elevator from the law that has it, when the ground has said so."""
+        if not self._commander.engaged and self.mode is not Mode.STANDBY:
+            self.event(Event.RELEASED, self._commander.released_by, now_ns)
+
+    def _stick_u(self) -> float:
+        """Return where the stick wants the elevator: its centre is neutral, its back end the stop that pitches up."""
+        stick, travel = self._sense * self._commander.stick, self.travel
+        end = travel.high if stick > 0.0 else travel.low
+        return travel.clip(travel.neutral + abs(stick) * (end - travel.neutral))
+
+    def unready(self, now_ns: int) -> list[str]:
+        """Return what keeps the law from flying now, in words; empty when nothing does."""
+        if self._worth_last is None or self._fresh_ns is None or now_ns - self._fresh_ns > self._stale_ns():
+            return ["no fresh state"]
+        reasons = [] if self._clock_known else ["plant clock not locked"]
+        event, reason = self._worth_last
+        if event not in _USABLE and reason not in (CLOCK_UNKNOWN,):
+            reasons.append(reason)
+        return reasons
 
     def _worth(self, sample: Sample, forecast: DelayEstimate, now_ns: int) -> tuple[Event, str]:
         """Return what a sample is to failsafe, and why."""
@@ -196,15 +304,15 @@ class Pilot:
             return verdict.event, verdict.reason
         if forecast.d is None:
             return Event.OUTSIDE, "delay unknown"
-        law, wide = self.config.gains, self.conservative
+        wide = self.conservative
         # before the narrower law is believed in again, the plant's own word counts as much as the forecast
         delays = [forecast.d]
         if wide is not None and self._reported is not None and now_ns - self._reported[1] <= REPORT_NS:
             delays.append(self._reported[0])
-        inside = all(_holds(law, d) for d in delays)
+        inside = all(self._in_window(d) for d in delays)
         if inside and self._clock_known:
             return Event.GOOD, f"delay {forecast.d}"
-        reason = "plant clock unknown" if inside else f"delay {max(delays)}"
+        reason = CLOCK_UNKNOWN if inside else f"delay {max(delays)}"
         usable = wide is not None and all(_holds(wide, d) for d in delays)
         return Event.WIDE if usable else Event.OUTSIDE, reason
 
@@ -219,23 +327,59 @@ class Pilot:
 
     # The reference
 
-    def _look(self, sample: Sample, forecast: DelayEstimate, gains: Gains, was: Mode) -> tuple[float, ...]:
-        """Return the reference state that the command carries: xr(j + d)."""
+    def _look(
+        self, sample: Sample, forecast: DelayEstimate, gains: Gains, was: Mode
+    ) -> tuple[tuple[float, ...], float]:
+        """Return the reference state that the command carries, xr(j + d), and r(j)."""
         reference = self.reference
         if reference is None:
-            return ()
+            return (), 0.0
         reference.advance(sample.j)
-        eased = self.failsafe.ground_lost and self.config.failsafe == "on"
-        if self._eased is not eased:
-            self._eased = eased
-            reference.follow(Profile() if self._eased else self.config.profile)
         ahead = 0
         if self.config.align:
-            unknown, most = self.config.gains.d_min, self.config.gains.d_max + MAX_AHEAD
+            unknown, most = self.window[0], self.window[1] + MAX_AHEAD
             ahead = min(forecast.d, most) if forecast.d is not None else unknown
-        if self.config.failsafe == "on" and _enters(was, self.mode):
+        self._ahead = ahead
+        target = self._wanted_target()
+        if target is not self._target:
+            self._aim(target)
+        if self.config.failsafe == "on" and self._takes_over(was):
             self._match_reference(reference, sample, gains, ahead)
-        return reference.ahead(ahead)
+        self._law_changed = False
+        return reference.ahead(ahead), self._source.r(sample.j)
+
+    def _takes_over(self, was: Mode) -> bool:
+        """Return whether a law takes over from a hand, from the last command, from neutral, or from another law."""
+        if self.mode not in FLOWN_BY_LAW:
+            return False
+        return _enters(was, self.mode) or self._law_changed or (was is Mode.STANDBY and self._idle)
+
+    def _wanted_target(self) -> Target:
+        """Return the reference that is to be flown: the ground's, eased to trim while the ground is lost."""
+        eased = self.failsafe.ground_lost and self.config.failsafe == "on"
+        return _TRIM if eased else self._commander.target
+
+    def _aim(self, target: Target) -> None:
+        """Follow another reference, from the first sample on that no command has looked ahead to."""
+        first = self._target is None
+        self._target = target
+        source, max_rate = self._source, self.max_rate
+        source.set_limits(*((-self.max_pitch, self.max_pitch) if self.max_pitch is not None else _NO_LIMITS))
+        match target:
+            case Steady(pitch):
+                source.set_target(pitch, max_rate)
+            case Moving(rate):
+                source.set_rate(rate * self.model.Ts, max_rate)
+            case Programmed():
+                if self._program is None or self._program[0] is not target:
+                    self._program = target, 0 if first else source.horizon + 1
+                source.set_source(Shifted(self.config.profile, self._program[1]), max_rate)
+
+    def shape(self, max_pitch: float | None, max_rate: float | None) -> None:
+        """Limit the pitch reference, rad from trim, and its change, rad per sample; None for no limit."""
+        self.max_pitch, self.max_rate = max_pitch, max_rate
+        if self._target is not None:
+            self._aim(self._target)
 
     def _match_reference(self, reference: ReferenceModel, sample: Sample, gains: Gains, ahead: int) -> None:
         """Let the reference go on from where the aircraft is: a law takes over without a jump of the elevator."""
@@ -244,11 +388,6 @@ class Pilot:
         dx = np.array(sample.x) - self.model.trim.x
         du, step_ahead = self._u - self.travel.neutral, reference.step_ahead(ahead)
         reference.set(match_reference(self.model, gains.K1, gains.K2, dx, du, step_ahead))
-
-    def _new_reference(self) -> ReferenceModel | None:
-        if self.model.reference is None:
-            return None
-        return ReferenceModel(self.model.reference, self.config.profile)
 
     # What else happens
 
@@ -269,7 +408,9 @@ class Pilot:
         if self._first_j is None or self._last is None or not self._first_j <= j <= self._last.j or d < 1:
             return False  # the command of an autopilot before this one, or of another epoch, or of none
         self._reported = (d, now_ns)
-        in_window = _holds(self.config.gains, d)
+        if not self._commander.engaged:
+            return True
+        in_window = self._in_window(d)
         fits = in_window
         if self.conservative is not None and self.mode not in FLOWN_BY_FIRST_LAW:
             fits = _holds(self.conservative, d)
@@ -288,6 +429,7 @@ class Pilot:
         """Raise what is due by time alone; return whether neutral is to be sent again, as no sample comes."""
         if lost := self.ground.tick(now_ns):
             self.event(lost, "ground station lost", now_ns)
+        self._release(now_ns)
         due_ns = self._mode_ends_ns()
         if due_ns is None or now_ns < due_ns:
             return False
@@ -301,7 +443,7 @@ class Pilot:
             return False
         self._u, self._saturated = self.travel.neutral, False
         self._plausibility.commanded(self._u)
-        self._saturation.told(saturated=False, now_ns=now_ns)
+        self.saturation.told(saturated=False, now_ns=now_ns)
         self._next_repeat_ns = now_ns + self._Ts_ns
         return True
 
@@ -335,11 +477,31 @@ class Pilot:
         """The oldest state that the law in force may use, samples."""
         if self.mode is Mode.CONSERVATIVE and self.conservative is not None:
             return self.conservative.d_max
-        return self.config.gains.d_max
+        return self.window[1]
 
     def _stale_ns(self) -> int:
         """Return the age at which a state is stale: d_max samples, and a little for clocks that differ."""
         return self._patience * self._Ts_ns + self._Ts_ns // 4
+
+    def _in_window(self, d: int) -> bool:
+        """Return whether the law may fly at a delay."""
+        return self.window[0] <= d <= self.window[1]
+
+
+def elevator_sense(model: Model) -> int:
+    """Return 1 where more elevator pitches up, -1 where it pitches down: the sign of the pitch's first answer to it.
+
+    Of y(k) = pitch the first non-zero of C B, C A B, ... counts; 1 without any, or without a pitch.
+    """
+    index = pitch_index(model)
+    if index is None:
+        return 1
+    answer = model.B[:, 0]
+    for _ in range(model.nx):
+        if answer[index] != 0.0:
+            return 1 if answer[index] > 0.0 else -1
+        answer = model.A @ answer
+    return 1
 
 
 def _holds(gains: GainLaw, d: int) -> bool:
@@ -349,6 +511,6 @@ def _holds(gains: GainLaw, d: int) -> bool:
 
 def _enters(was: Mode, mode: Mode) -> bool:
     """Return whether a law takes over from the last command, from neutral, or from the other law."""
-    if was is Mode.STANDBY or mode not in FLOWN_BY_LAW:
+    if was is Mode.STANDBY:
         return False
     return was not in FLOWN_BY_LAW or (was is Mode.CONSERVATIVE) is not (mode is Mode.CONSERVATIVE)

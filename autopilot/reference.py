@@ -2,94 +2,30 @@
 
 The paper's law, Eq. (9), takes xr fresh at the actuator. The command computed from sample j is applied
 at sample j + d, so it must carry xr(j + d); :class:`ReferenceModel` advances by the sample's number (also
-across lost samples) and looks ahead by the forecast d. A programmed profile is known in advance, so with
-the right d the alignment is exact.
+across lost samples) and looks ahead by the forecast d. A programmed r is known in advance, and a streamed one is
+promised as far as it was looked ahead to, so with the right d the alignment is exact.
 """
 
 from __future__ import annotations
 
-import itertools
-import math
-import re
 from collections import deque
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from autopilot.profile import MAX_GAP, Source
 from gains.model import Model, Reference
-from gains.table import InputError
 
-__all__ = ["AffineStep", "Profile", "ReferenceModel", "match_reference", "parse_profile"]
+__all__ = ["AffineStep", "ReferenceModel", "match_reference"]
 
 LOOP_LIMIT = 64
 """Up to so many steps are taken one by one; a longer stretch of constant r is one matrix power."""
 
+CHANGES_LIMIT = 2 * MAX_GAP
+"""Up to so many changes of r are followed over one gap; a streamed reference makes fewer of them."""
+
 Vector = NDArray[np.float64]
-
-
-@dataclass(frozen=True, slots=True)
-class Profile:
-    """A programmed reference: piecewise constant, zero before the first switch.
-
-    Attributes
-    ----------
-    switches : tuple of (int, float)
-        Sample number and the value of r from that sample on, in rising order.
-    """
-
-    switches: tuple[tuple[int, float], ...] = ()
-
-    def r(self, k: int) -> float:
-        """Return r(k)."""
-        value = 0.0
-        for start, r in self.switches:
-            if k < start:
-                break
-            value = r
-        return value
-
-    def constant_until(self, k: int, end: int) -> int:
-        """Return the first sample after k, at most ``end``, at which r may differ from r(k)."""
-        return min((start for start, _ in self.switches if k < start < end), default=end)
-
-
-_ITEM = re.compile(r"(?P<value>[-+0-9.eE]+)(?P<unit>deg|rad|)@(?P<time>[0-9.eE+-]+)s")
-
-
-def parse_profile(text: str, Ts: float) -> Profile:
-    """Return the profile written as ``5deg@1s,0deg@6s``: r becomes 5 degrees at 1 s and 0 at 6 s.
-
-    Parameters
-    ----------
-    text : str
-        Comma-separated ``VALUE@TIMEs``; a value may carry ``deg`` or ``rad``, else it is in the model's
-        units. Empty for no reference.
-    Ts : float
-        Sampling period in s; a switch takes effect at the first sample not before its time.
-
-    Raises
-    ------
-    InputError
-        For anything else.
-    """
-    switches: list[tuple[int, float]] = []
-    for item in filter(None, (part.strip() for part in text.split(","))):
-        match = _ITEM.fullmatch(item)
-        try:
-            if match is None:
-                raise ValueError
-            value = float(match["value"])
-            start = math.ceil(float(match["time"]) / Ts - 1e-9)
-            if not math.isfinite(value) or start < 0:
-                raise ValueError
-        except (ValueError, OverflowError):
-            raise InputError(f'reference "{text}": expected VALUE@TIMEs such as 5deg@1s, found "{item}"') from None
-        switches.append((start, math.radians(value) if match["unit"] == "deg" else value))
-    if any(later[0] <= earlier[0] for earlier, later in itertools.pairwise(switches)):
-        raise InputError(f'reference "{text}": expected rising times')
-    return Profile(tuple(switches))
 
 
 class AffineStep(NamedTuple):
@@ -100,25 +36,28 @@ class AffineStep(NamedTuple):
 
 
 class ReferenceModel:
-    """State of Eq. (8), driven by a profile.
+    """State of Eq. (8), driven by a source of r.
 
     Parameters
     ----------
     reference : Reference
         Ar, Br, Cr; one reference input.
-    profile : Profile
+    source : Source
         r(k).
 
     Attributes
     ----------
     k : int
         The sample that the state belongs to; the state is zero at k = 0.
+    skipped : int
+        Samples of gaps in which r changed more often than ``CHANGES_LIMIT``: r was taken as in the gap's last sample.
     """
 
-    def __init__(self, reference: Reference, profile: Profile) -> None:
+    def __init__(self, reference: Reference, source: Source) -> None:
         self.reference = reference
-        self.profile = profile
+        self.source = source
         self.k = 0
+        self.skipped = 0
         self._states: deque[Vector] = deque([np.zeros(reference.Ar.shape[0])])
         """xr(k), xr(k + 1), ...: a state looked ahead to is not computed again."""
 
@@ -131,9 +70,9 @@ class ReferenceModel:
         """Put the state at sample k elsewhere."""
         self._states = deque([xr])
 
-    def follow(self, profile: Profile) -> None:
-        """Follow another profile from here on; the state stays."""
-        self.profile = profile
+    def follow(self, source: Source) -> None:
+        """Follow another source from here on; the state stays."""
+        self.source = source
         self.set(self.xr)
 
     def advance(self, j: int) -> Vector:
@@ -162,9 +101,15 @@ class ReferenceModel:
     def _propagate(self, xr: Vector, start: int, end: int) -> Vector:
         """Return xr(end) from xr(start)."""
         Ar, Br = self.reference.Ar, self.reference.Br[:, 0]
+        changes = 0
         while start < end:
-            until = self.profile.constant_until(start, end)
-            drive = Br * self.profile.r(start)
+            if changes < CHANGES_LIMIT:
+                until, r = self.source.constant_until(start, end), self.source.r(start)
+            else:  # Ar is Schur: what r was then is forgotten within seconds
+                until, r = end, self.source.r(end - 1)
+                self.skipped += end - start
+            changes += 1
+            drive = Br * r
             if until - start <= LOOP_LIMIT:
                 for _ in range(until - start):
                     xr = Ar @ xr + drive

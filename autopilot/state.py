@@ -435,7 +435,7 @@ class SampleAssembler:
             self.lost = "sample numbers fell back"
             return None
         self._last_j = j if self._last_j is None else max(j, self._last_j)
-        return replace(whole, j=j)
+        return Sample(j, whole.t_ns, whole.x, whole.parts, whole.alpha)
 
     def _count(self, number: tuple[int, int], t_ns: int) -> int:
         """Return the number at a stamp, which is good to a millisecond."""

@@ -14,6 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
 
+from autopilot.link.keyfile import read_key
+from autopilot.link.keyring import CONTROL_LINK, Keyring
 from autopilot.link.process import ADDRESS, ProcessOptions, process_options, run_node
 from autopilot.link.udp import Address, dial, listen
 from autopilot.link.wire import AUTOPILOT, frames_of
@@ -34,6 +36,7 @@ from sitl.summary import summary_table
 __all__ = ["main"]
 
 INTERRUPTED = 130
+KEY_FILE = click.Path(dir_okay=False, path_type=Path)
 SEED = click.IntRange(0, MAX_SEED)
 
 
@@ -88,6 +91,8 @@ def _square(text: str) -> SquareDelta:
 @click.option("--gust", "gust_s", type=FiniteRange(0.0), help="The gust of Eq. (52), from this time in s on.")
 @click.option("--uncertainty", help="Delta(k) of Eq. (51) as AMPLITUDE:HALF_PERIOD, for example 0.15:20.")
 @click.option("--no-aoa", is_flag=True, help="Send no AOA_SSA, as many vehicles do not.")
+@click.option("--key", "key_file", type=KEY_FILE, help="Sign the link with the key in this file (README, Security).")
+@click.option("--accept-unsigned", is_flag=True, help="With --key: hear frames without signature, too.")
 @process_options
 def plant(
     plant_name: str,
@@ -99,6 +104,8 @@ def plant(
     gust_s: float | None,
     uncertainty: str | None,
     no_aoa: bool,
+    key_file: Path | None,
+    accept_unsigned: bool,
     **process: Any,
 ) -> None:
     """Fly an aircraft: integrate, sense, take the elevator from the network. Runs until Ctrl-C."""
@@ -119,9 +126,15 @@ def plant(
         servo_timeout or None,
         not no_aoa,
     )
-    openers = [partial(listen, "autopilot", address, peer=peer, accept=frames_of(AUTOPILOT))]
+    options = ProcessOptions(**process)
+    keyring, seal = Keyring("plant", options.clock), None
+    if key_file is not None:
+        seal = keyring.seal(
+            "autopilot", key_file, CONTROL_LINK, peer_link=CONTROL_LINK, accept_unsigned=accept_unsigned
+        )
+    openers = [partial(listen, "autopilot", address, peer=peer, accept=frames_of(AUTOPILOT, seal))]
     metadata = {"program": "sitl plant", "plant": plant_name, "lagproof": version()}
-    run_node("plant", PlantNode(config), openers, ProcessOptions(**process), metadata, tap=False)
+    run_node("plant", PlantNode(config, seal), openers, options, metadata, tap=False, keyring=keyring)
 
 
 LINK_OPTIONS = (
@@ -169,7 +182,7 @@ def relay(
     openers = [partial(listen, "autopilot", address, peer=peer, accept=heard), partial(dial, "plant", to)]
     metadata = {"program": "sitl relay", "seed": str(seed), "lagproof": version()}
     node = RelayNode(*link, seed, None if witness is None else Gate(witness))
-    run_node("relay", node, openers, ProcessOptions(**process), metadata, tap=False)
+    run_node("relay", node, openers, ProcessOptions(**process), metadata, tap=False, control=len(openers))
 
 
 @cli.command("fly")
@@ -185,6 +198,9 @@ def relay(
 @click.option("--out", type=click.Path(file_okay=False, path_type=Path), help="Folder for the files.")
 @click.option("--gcs", multiple=True, default=("udpout:127.0.0.1:14550",), show_default=True,
               help='Ground station; may be repeated; "none" for none.')  # fmt: skip
+@click.option("--wait-arm", is_flag=True, help="Leave arming to a ground station; else the vehicle arms itself.")
+@click.option("--key", "key_file", type=KEY_FILE, help="Sign the control link with the key in this file.")
+@click.option("--gcs-key", "gcs_key_file", type=KEY_FILE, help="Sign the ground stations' links with this key.")
 @click.option("--port-base", type=click.IntRange(0, 65_000), default=DEFAULT_PORT_BASE, show_default=True,
               help="The plant's port, the relay's is the next; 0 for any free ones.")  # fmt: skip
 @click.option("--json", "as_json", is_flag=True, help="Print the summary as one JSON object.")
@@ -198,6 +214,9 @@ def fly_(
     virtual: bool,
     out: Path | None,
     gcs: tuple[str, ...],
+    wait_arm: bool,
+    key_file: Path | None,
+    gcs_key_file: Path | None,
     port_base: int,
     as_json: bool,
     **changes: Any,
@@ -211,10 +230,16 @@ def fly_(
     stations = tuple(address for address in gcs if address != "none")
     for address in stations:
         dial("gcs", ADDRESS.convert(address, None, None)).socket.close()  # refused now rather than by a program
+    if virtual and (wait_arm or key_file or gcs_key_file):
+        raise InputError("--virtual: nobody can arm, and nothing is signed, in virtual time")
+    for path in filter(None, (key_file, gcs_key_file)):
+        read_key(path)  # refused now rather than by a program
     folder = out or _new_folder(f"{scenario.name}-{datetime.now():%Y%m%d-%H%M%S}")
     console = Console(stderr=True)
     try:
-        outcome = fly(scenario, FlightOptions(virtual, folder, stations, port_base), console)
+        outcome = fly(
+            scenario, FlightOptions(virtual, folder, stations, port_base, wait_arm, key_file, gcs_key_file), console
+        )
     except FlightFailed as failure:
         click.echo(f"sitl: error: {failure}", err=True)
         return NEGATIVE

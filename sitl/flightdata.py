@@ -14,8 +14,9 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from autopilot.reference import parse_profile
+from autopilot.profile import parse_profile
 from gains.model import Matrix, Model
+from gains.table import InputError
 from sitl.impairment import Fate
 
 __all__ = ["FlightData", "FlightEvent", "LinkPackets", "ModeInterval"]
@@ -256,13 +257,12 @@ class _Collected:
 
 
 def _reference_inputs(model: Model, found: _Collected, metadata: Mapping[str, str]) -> Callable[[int], Matrix]:
-    """Return r as a function of the sample: the recording's programmed reference, else what commands recorded.
+    """Return r as a function of the sample: the programmed reference if that was flown, else what commands recorded.
 
     A sample whose command is missing does not say what r was; the last one known then stands in.
     """
-    if "reference" in metadata:
-        profile = parse_profile(metadata["reference"], model.Ts)
-        return lambda sample: np.array([profile.r(sample - max(s for s in found.starts if s <= sample))])
+    if (programmed := _programmed_inputs(model, found, metadata)) is not None:
+        return programmed
     width = 0 if model.reference is None else model.reference.Br.shape[1]
     known = {place: body["r"] for place, body in found.commands.items() if body["r"] is not None}
     places = sorted(known)
@@ -273,6 +273,20 @@ def _reference_inputs(model: Model, found: _Collected, metadata: Mapping[str, st
         return np.array(known[places[i - 1]], dtype=np.float64) if known_since_start else np.zeros(width)
 
     return recorded
+
+
+def _programmed_inputs(model: Model, found: _Collected, metadata: Mapping[str, str]) -> Callable[[int], Matrix] | None:
+    """Return the recording's programmed reference; None where a command was for another one."""
+    try:
+        profile = parse_profile(metadata["reference"], model.Ts)
+    except (KeyError, InputError):  # none is named, or its file is elsewhere
+        return None
+
+    def programmed(sample: int) -> Matrix:
+        return np.array([profile.r(sample - max(s for s in found.starts if s <= sample))])
+
+    flown = all(body["r"] is None or body["r"] == programmed(place).tolist() for place, body in found.commands.items())
+    return programmed if flown else None
 
 
 def _reference_outputs(

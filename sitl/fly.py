@@ -51,12 +51,19 @@ class FlightOptions:
         Addresses that get telemetry.
     port_base : int
         The plant listens there and the relay on the next port; 0 for any free ports.
+    wait_arm : bool
+        Leave arming to a ground station.
+    key_file, gcs_key_file : Path or None
+        Keys of the control link and of the ground stations' links, over UDP.
     """
 
     virtual: bool
     folder: Path | None
     ground_stations: tuple[str, ...] = ()
     port_base: int = DEFAULT_PORT_BASE
+    wait_arm: bool = False
+    key_file: Path | None = None
+    gcs_key_file: Path | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -216,7 +223,9 @@ def _start_programs(
     relay_port = options.port_base + 1 if options.port_base else 0
     stations = [argument for address in options.ground_stations or ("none",) for argument in ("--gcs", address)]
     try:
-        supervisor.start("plant", ["sitl", "plant", "--listen", f"127.0.0.1:{plant_port}", *plant_arguments(scenario)])
+        key = [] if options.key_file is None else ["--key", str(options.key_file)]
+        listen = ["--listen", f"127.0.0.1:{plant_port}"]
+        supervisor.start("plant", ["sitl", "plant", *listen, *key, *plant_arguments(scenario)])
         if not plant_port:
             plant_port = supervisor.wait_ready("plant", interrupted).get("autopilot", ("", 0))[1]
         if interrupted():
@@ -227,7 +236,7 @@ def _start_programs(
             relay_port = supervisor.wait_ready("relay", interrupted).get("autopilot", ("", 0))[1]
         if interrupted():
             return
-        plant = ["--plant", f"udpout:127.0.0.1:{relay_port}"]
+        plant = ["--plant", f"udpout:127.0.0.1:{relay_port}", *_ground_arguments(options)]
         supervisor.start("autopilot", ["autopilot", *plant, *stations, *autopilot_arguments(scenario)])
         for name in ("plant", "relay", "autopilot"):
             supervisor.wait_ready(name, interrupted)
@@ -235,6 +244,14 @@ def _start_programs(
         if death.code == 2 and death.last_words:
             raise InputError(re.sub(r"^\w+: error: ", "", death.last_words)) from None
         raise
+
+
+def _ground_arguments(options: FlightOptions) -> list[str]:
+    """Return the options of the autopilot that are none of the scenario."""
+    arguments = ["--wait-arm"] if options.wait_arm else []
+    for port, path in (("plant", options.key_file), ("gcs", options.gcs_key_file)):
+        arguments += [] if path is None else ["--key", f"{port}={path}"]
+    return arguments
 
 
 def _conclude(scenario: Scenario, options: FlightOptions, recorder: FlightRecorder, interrupted: bool) -> Outcome:

@@ -336,15 +336,20 @@ class Impairment:
         """
         spec = self.spec
         lost = self._lost()
-        copies = 1 + (spec.dup > 0.0 and self._dup() < spec.dup)
-        flights = [self._draw(which) for which in ((0, 1) if spec.dup > 0.0 else (0,))]
+        flights = [self._draw(0)]
+        if spec.dup > 0.0:
+            twice, further = self._dup() < spec.dup, self._draw(1)
+            if twice:
+                flights.append(further)
         if lost:
             return (Copy(Fate.LOST, now_ns),)
         if spec.blackouts and spec.is_out(now_ns):
             return (Copy(Fate.BLACKOUT, now_ns),)
+        if room > 0 and len(flights) == 1:  # as nearly always
+            return (self._launch(size_bytes, now_ns, flights[0]),)
         return tuple(
             self._launch(size_bytes, now_ns, flight_ns) if n < room else Copy(Fate.REFUSED, now_ns)
-            for n, flight_ns in enumerate(flights[:copies])
+            for n, flight_ns in enumerate(flights)
         )
 
     def _draw(self, which: int) -> int | None:

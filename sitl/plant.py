@@ -30,6 +30,7 @@ from autopilot.link.wire import (
     HilActuatorControls,
     Message,
     NamedValueInt,
+    Seal,
     ServoOutputRaw,
     Timesync,
     VfrHud,
@@ -133,6 +134,13 @@ class _Flight:
 class PlantNode:
     """Node with the one port ``autopilot``.
 
+    Parameters
+    ----------
+    config : PlantConfig
+        What flies.
+    seal : Seal, optional
+        Signs what is sent, and checks what is heard.
+
     Attributes
     ----------
     samples : int
@@ -141,12 +149,12 @@ class PlantNode:
         Commands that were not taken, by kind.
     """
 
-    def __init__(self, config: PlantConfig) -> None:
+    def __init__(self, config: PlantConfig, seal: Seal | None = None) -> None:
         self.config = config
         self.model = config.model
         self.travel = travel_of(config.model)
         self.aircraft = LinearAircraft(config.model)
-        self.wire = Wire(PLANT, AUTOPILOT)
+        self.wire = Wire(PLANT, AUTOPILOT, seal=seal)
         self.refusals: Counter[Refusal] = Counter()
         self._gust = replace(config.gust) if config.gust is not None else None
         self._sensors = sensors_of(config.model)
@@ -165,6 +173,8 @@ class PlantNode:
     def receive(self, port: str, datagram: bytes, now_ns: int) -> None:
         """Take one datagram of the autopilot."""
         assert port == PORT
+        if self.wire.seal is not None:
+            self.wire.seal.tick(now_ns)
         for message in self.wire.decode(datagram):
             if self._next_heartbeat_ns is None:
                 self._next_heartbeat_ns = now_ns
@@ -184,6 +194,8 @@ class PlantNode:
 
     def tick(self, now_ns: int) -> None:
         """Work off the samples that are due."""
+        if self.wire.seal is not None:
+            self.wire.seal.tick(now_ns)
         if self._next_heartbeat_ns is not None and now_ns >= self._next_heartbeat_ns:
             self._next_heartbeat_ns = following(self._next_heartbeat_ns, NS_PER_S, now_ns)
             self._send(plant_heartbeat())
@@ -298,7 +310,7 @@ class PlantNode:
         if flight.crashed:
             return
         following = self.aircraft.step(flight.x, flight.position, w, delta)
-        if not np.all(np.abs(following) < DIVERGED):
+        if not all(-DIVERGED < value < DIVERGED for value in following.tolist()):
             flight.crashed = True
             self._event("diverged", f"state beyond {DIVERGED:g} at sample {flight.k + 1}", t_ns)
             return

@@ -17,11 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from autopilot.alpha import AlphaChoice
-from autopilot.app import AutopilotConfig, AutopilotNode
+from autopilot.app import AutopilotNode
+from autopilot.config import AutopilotConfig
 from autopilot.failsafe import Mode
 from autopilot.link.clock import Clock
 from autopilot.link.process import format_clock, parse_clock
-from autopilot.reference import parse_profile
+from autopilot.profile import parse_profile
 from gains.model import GainLaw, Model
 from gains.store import load_law, load_model
 from gains.table import InputError, Table
@@ -135,7 +136,7 @@ class Scenario:
     seed : int
         Of everything random.
     reference : str
-        Programmed reference (:func:`autopilot.reference.parse_profile`).
+        Programmed reference (:func:`autopilot.profile.parse_profile`).
     up, down : LinkSpec
         Plant to autopilot, and back.
     clocks : mapping

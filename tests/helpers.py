@@ -9,7 +9,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
-from autopilot.app import AutopilotConfig, AutopilotNode
+from autopilot.app import AutopilotNode
+from autopilot.config import AutopilotConfig
 from autopilot.link.clock import Clock
 from autopilot.link.node import Record
 from autopilot.link.virtual import Participant, VirtualNetwork

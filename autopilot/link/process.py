@@ -18,6 +18,7 @@ from typing import Any, TypeVar
 import click
 
 from autopilot.link.clock import NS_PER_S, Clock
+from autopilot.link.keyring import Keyring
 from autopilot.link.node import Node, Record
 from autopilot.link.record import McapRecorder
 from autopilot.link.stream import StreamSink
@@ -27,6 +28,7 @@ from gains.table import InputError
 __all__ = [
     "ADDRESS",
     "CLOCK",
+    "Parsed",
     "ProcessOptions",
     "format_clock",
     "parse_clock",
@@ -83,7 +85,7 @@ def format_clock(clock: Clock) -> str:
     return f"{clock.offset_ns / NS_PER_S:.9f}s:{clock.drift_ppb / 1000:.3f}ppm"
 
 
-class _Parsed(click.ParamType[Any]):
+class Parsed(click.ParamType[Any]):
     """A click type from a function that raises InputError."""
 
     def __init__(self, name: str, parse: Callable[[str], Any]) -> None:
@@ -95,8 +97,8 @@ class _Parsed(click.ParamType[Any]):
         return self._parse(value) if isinstance(value, str) else value
 
 
-ADDRESS = _Parsed("ADDRESS", parse_address)
-CLOCK = _Parsed("CLOCK", parse_clock)
+ADDRESS = Parsed("ADDRESS", parse_address)
+CLOCK = Parsed("CLOCK", parse_clock)
 
 
 def process_options(command: F) -> F:
@@ -143,6 +145,8 @@ def run_node(
     *,
     tap: bool,
     banner: str = "",
+    control: int = 1,
+    keyring: Keyring | None = None,
 ) -> None:
     """Run a node over UDP until Ctrl-C, SIGTERM or the end of the record stream.
 
@@ -162,6 +166,10 @@ def run_node(
         Whether datagrams are recorded.
     banner : str
         What is said once everything is open.
+    control : int
+        How many of the ports are control ports.
+    keyring : Keyring, optional
+        The keys of the ports; it is closed at the end.
 
     Raises
     ------
@@ -197,7 +205,13 @@ def run_node(
             click.echo(banner, err=True)
         gc.collect()
         gc.freeze()  # what is loaded now stays: no later collection has to look at it
-        driver = stack.enter_context(closing(UdpDriver(node, ports, options.clock, sink, tap=tap)))
+        on_pass = None
+        if keyring is not None:
+            stack.callback(keyring.close)
+            on_pass = keyring.pass_
+        driver = stack.enter_context(
+            closing(UdpDriver(node, ports, options.clock, sink, tap=tap, control=control, on_pass=on_pass))
+        )
         driver.run(lambda: stopped or (stream is not None and stream.closed))
         if sink is not None:
             lost = stream.lost if stream is not None else 0

@@ -15,7 +15,7 @@ from autopilot.link.wire import AoaSsa, Attitude
 from gains.model import Model
 from gains.table import InputError
 
-__all__ = ["MIN_TS_NS", "Measurement", "Sensor", "sensors_of"]
+__all__ = ["MIN_TS_NS", "Measurement", "Sensor", "pitch_index", "sensors_of"]
 
 Measurement = Attitude | AoaSsa
 
@@ -74,3 +74,9 @@ def sensors_of(model: Model) -> tuple[Sensor, ...]:
         used[name] = state
         sensors.append(_SENSORS[name])
     return tuple(sensors)
+
+
+def pitch_index(model: Model) -> int | None:
+    """Return which state is the pitch angle; None where none is."""
+    carried = [model.sensors.get(state) for state in model.states]
+    return carried.index("ATTITUDE.pitch") if "ATTITUDE.pitch" in carried else None

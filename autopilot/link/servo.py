@@ -6,6 +6,7 @@ Both ends of the link use the same travel, so the mapping has one home.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 from gains.model import Model
@@ -27,11 +28,15 @@ class Travel:
         Ends of the travel, in units of u.
     neutral : float
         The trim input.
+    stop_low, stop_high : float
+        Where a command must stop, within the travel or beyond it; none by default.
     """
 
     low: float
     high: float
     neutral: float
+    stop_low: float = -math.inf
+    stop_high: float = math.inf
 
     def to_pwm(self, u: float) -> int:
         """Return the pulse in microseconds for u, rounded to the nearest."""
@@ -54,8 +59,8 @@ class Travel:
         return self.low + 0.5 * (control + 1.0) * (self.high - self.low)
 
     def clip(self, u: float) -> float:
-        """Return u limited to the travel."""
-        return min(max(u, self.low), self.high)
+        """Return u limited to the travel and its stops."""
+        return min(max(u, self.low, self.stop_low), self.high, self.stop_high)
 
 
 def travel_of(model: Model) -> Travel:

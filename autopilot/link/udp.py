@@ -1,16 +1,24 @@
 """The UDP driver: one node, its sockets, the wall clock, one selector loop.
 
-Ports are served in the order given, control first, and a bounded number of datagrams of each per pass, so
-no port starves another or the node's deadlines. A peer that is not there is no error. A port that dials
-talks to its one peer; a port that listens latches the first address whose datagram it is told to accept,
-lets go of it after a silence, and counts strangers.
+One pass of the loop is bounded work: it looks at the control ports, of which a bounded number of datagrams
+is served; then it serves one datagram of one other port, the next in turn that has any; then the node's
+deadline. So whatever waits at the other ports, a control datagram waits for one of them at the most, and
+none of them waits for more than one of each other port. What a flood piles up, it piles up in the kernel's
+buffer of the port that it floods; what does not fit there the kernel drops and counts.
+
+A peer that is not there is no error. A port that dials talks to its one peer, by a connected socket: the kernel
+drops strangers, and we never wake for them. A port that listens latches the first address whose datagram it is
+told to accept, lets go of it after a silence, and counts strangers. Its socket stays unconnected, since the
+kernel would not tell how many it dropped nor that somebody new calls; dropping a stranger costs one system call
+and one comparison, and not even a copy of what he said.
 """
 
 from __future__ import annotations
 
 import select
 import socket
-from collections.abc import Callable, Sequence
+import struct
+from collections.abc import Callable, Collection, Sequence
 from time import perf_counter_ns  # noqa: TID251  a driver reads the clock; this one is common to all processes
 from typing import Protocol
 
@@ -19,10 +27,20 @@ from autopilot.link.node import Datagram, Node, Record
 from autopilot.link.record import frame_record
 from gains.table import InputError
 
-__all__ = ["Address", "RecordSink", "UdpDriver", "UdpPort", "dial", "listen", "parse_address", "true_ns"]
+__all__ = [
+    "Address",
+    "RecordSink",
+    "UdpDriver",
+    "UdpPort",
+    "dial",
+    "listen",
+    "next_in_turn",
+    "parse_address",
+    "true_ns",
+]
 
 MAX_PER_PASS = 32
-"""Datagrams of one port that one pass serves."""
+"""Datagrams of one control port that one pass takes, strangers' included; of the other ports it takes one in all."""
 
 MAX_DATAGRAM = 65_535
 
@@ -33,6 +51,12 @@ MAX_WAIT_NS = NS_PER_S // 4
 """Longest sleep, so that a request to stop is soon seen."""
 
 RECEIVE_BUFFER_BYTES = 1 << 20
+"""What the kernel is asked to hold for each port, in its own accounting: hundreds of bytes for a small datagram."""
+
+SO_MEMINFO = 55
+"""Linux, ``asm-generic/socket.h``; Python does not name it."""
+MEMINFO = struct.Struct("=9I")
+MEMINFO_DROPS = 8
 
 Address = tuple[str, int]
 
@@ -107,6 +131,15 @@ class UdpPort:
         name = self.socket.getsockname()
         return str(name[0]), int(name[1])
 
+    @property
+    def overflowed(self) -> int | None:
+        """Datagrams that the kernel dropped because the receive buffer was full; None where it does not tell."""
+        try:
+            info = self.socket.getsockopt(socket.SOL_SOCKET, SO_MEMINFO, MEMINFO.size)
+        except OSError:
+            return None
+        return int(MEMINFO.unpack(info)[MEMINFO_DROPS]) if len(info) == MEMINFO.size else None
+
     def receive(self, now_ns: int) -> bytes | None:
         """Return the next datagram of the peer, b"" for one that was dropped, None when there is none."""
         try:
@@ -115,12 +148,11 @@ class UdpPort:
             return None
         except OSError:
             return b""  # an earlier datagram of ours found nobody: no host, no network, or no program there
-        datagram = bytes(self._buffer[:size])
-        if not self._connected and not self._is_peer((sender[0], sender[1]), datagram, now_ns):
+        if not self._connected and sender[:2] != self.peer and not self._latches(sender[:2], size, now_ns):
             self.strangers += 1
             return b""
         self._heard_ns = now_ns
-        return datagram
+        return bytes(self._buffer[:size])
 
     def send(self, datagram: bytes) -> None:
         """Send to the peer; count what cannot be sent."""
@@ -135,13 +167,11 @@ class UdpPort:
         except OSError:
             self.unsent += 1  # nobody listens there, or the send buffer is full: UDP loses it
 
-    def _is_peer(self, sender: Address, datagram: bytes, now_ns: int) -> bool:
-        if sender == self.peer:
-            return True
-        if self._accept is None:
+    def _latches(self, sender: Address, size: int, now_ns: int) -> bool:
+        """Whether a stranger, whose datagram is in the buffer, becomes the peer."""
+        if self._accept is None or (self._heard_ns is not None and now_ns - self._heard_ns <= LATCH_SILENCE_NS):
             return False
-        silent = self._heard_ns is None or now_ns - self._heard_ns > LATCH_SILENCE_NS
-        if not silent or not self._accept(datagram):
+        if not self._accept(bytes(self._buffer[:size])):
             return False
         self.peer = sender
         return True
@@ -205,6 +235,12 @@ class RecordSink(Protocol):
         """Pass on what can be passed on without waiting."""
 
 
+def next_in_turn(ready: Sequence[bool], last: int) -> int | None:
+    """Return the index of the first that is ready after ``last``, going round; None when none is."""
+    count = len(ready)
+    return next((i % count for i in range(last + 1, last + 1 + count) if ready[i % count]), None)
+
+
 class UdpDriver:
     """Runs one node until told to stop.
 
@@ -220,6 +256,10 @@ class UdpDriver:
         Takes the records.
     tap : bool
         Whether datagrams are recorded too (``mavlink/<port>``).
+    control : int
+        How many of the ports are control ports.
+    on_pass : callable, optional
+        Called with the node's time at the end of each pass.
     """
 
     def __init__(
@@ -230,10 +270,15 @@ class UdpDriver:
         sink: RecordSink | None = None,
         *,
         tap: bool = False,
+        control: int = 1,
+        on_pass: Callable[[int], None] | None = None,
     ) -> None:
         self.node = node
         self.clock = Clock(clock.offset_ns, clock.drift_ppb, true_ns())
         self._ports = list(ports)
+        self._control, self._others = self._ports[:control], self._ports[control:]
+        self._last = -1
+        self._on_pass = on_pass
         self._sockets = [port.socket for port in ports]
         self._by_name = {port.name: port for port in ports}
         self._sink = sink
@@ -243,16 +288,32 @@ class UdpDriver:
         """Serve the node until ``stopping()`` holds."""
         while not stopping():
             ready = self._wait()
-            for port in self._ports:
-                if port.socket in ready:
-                    self._serve(port)
-            now_ns = self._now_ns()
-            deadline_ns = self.node.next_deadline_ns()
-            if deadline_ns is not None and now_ns >= deadline_ns:
-                self.node.tick(now_ns)
-            self._record(self._send())
-            if self._sink is not None:
-                self._sink.pump()
+            self.serve([port for port in self._ports if port.socket in ready])
+
+    def serve(self, ready: Collection[UdpPort]) -> None:
+        """Make one pass: control, one datagram of the others, what is due.
+
+        Parameters
+        ----------
+        ready : collection of UdpPort
+            Those that have a datagram.
+        """
+        for port in self._control:
+            if port in ready:
+                self._take(port, MAX_PER_PASS)
+        turn = next_in_turn([port in ready for port in self._others], self._last)
+        if turn is not None:
+            self._last = turn
+            self._take(self._others[turn], 1)
+        now_ns = self._now_ns()
+        deadline_ns = self.node.next_deadline_ns()
+        if deadline_ns is not None and now_ns >= deadline_ns:
+            self.node.tick(now_ns)
+        self._record(self._send())
+        if self._sink is not None:
+            self._sink.pump()
+        if self._on_pass is not None:
+            self._on_pass(now_ns)
 
     def close(self) -> None:
         """Close the sockets."""
@@ -270,9 +331,9 @@ class UdpDriver:
             wait_ns = min(wait_ns, max(0, self.clock.true_ns(deadline_ns) - true_ns()))
         return select.select(self._sockets, [], [], wait_ns / NS_PER_S)[0]
 
-    def _serve(self, port: UdpPort) -> None:
-        """Hand the node a bounded number of datagrams, sending its answers at once."""
-        for _ in range(MAX_PER_PASS):
+    def _take(self, port: UdpPort, most: int) -> None:
+        """Hand the node at most so many datagrams, sending its answers at once."""
+        for _ in range(most):
             datagram = port.receive(true_ns())
             at_ns = true_ns()  # not before it came: clocks are compared by this
             if datagram is None:

@@ -1,4 +1,4 @@
-"""Frozen message types and MAVLink 2 frames, one datagram at a time; the only importer of pymavlink.
+"""MAVLink 2 frames of frozen messages, one datagram at a time; the only importer of pymavlink.
 
 A :class:`Wire` is one end of one link: it numbers the frames it packs and checks the frames it parses.
 No parser state outlives a datagram, so a bad or truncated datagram can never swallow the next one.
@@ -15,16 +15,34 @@ from __future__ import annotations
 import math
 import struct
 from collections import Counter
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, fields
 from enum import StrEnum
-from typing import Any
+from typing import Any, Protocol
 
 from fastcrc.crc16 import mcrf4xx
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
+from autopilot.link import groundmessages as ground
+from autopilot.link.messages import (
+    AoaSsa,
+    Attitude,
+    ControlMessage,
+    Heartbeat,
+    HilActuatorControls,
+    NamedValueFloat,
+    NamedValueInt,
+    ServoOutputRaw,
+    Severity,
+    StatusText,
+    Timesync,
+    VfrHud,
+)
+
 __all__ = [
     "AUTOPILOT",
+    "CONTROL_MESSAGES",
+    "GROUND_MESSAGES",
     "PLANT",
     "AoaSsa",
     "Attitude",
@@ -36,6 +54,7 @@ __all__ = [
     "Reject",
     "ServoOutputRaw",
     "Severity",
+    "Source",
     "StatusText",
     "Timesync",
     "VfrHud",
@@ -46,6 +65,11 @@ __all__ = [
     "split_frames",
 ]
 
+Source = tuple[int, int]
+"""System and component."""
+
+Message = ControlMessage | ground.GroundMessage
+
 AUTOPILOT = (1, 1)
 """MAVLink system and component of the autopilot."""
 
@@ -55,17 +79,24 @@ PLANT = (1, 25)
 MAX_DATAGRAM_BYTES = 2048
 """Longest datagram that is looked at; a MAVLink 2 frame has at most 280 bytes."""
 
+MAX_FRAMES = 64
+"""Frames of one datagram that are looked at: what one datagram costs is bounded."""
+
 U32 = 0xFFFFFFFF
 ELEVATOR_CHANNEL = 1
 """Index of the elevator in HIL_ACTUATOR_CONTROLS.controls; servo output 2 in SERVO_OUTPUT_RAW."""
 
 _SIGNED = dialect.MAVLINK_IFLAG_SIGNED
 
+ACCEPTED = "accepted"
+"""What a seal says of a frame that it accepts."""
+
 
 class Reject(StrEnum):
     """Why a frame or a datagram was dropped."""
 
     OVERSIZE = "oversize"
+    EXCESS = "excess"
     NO_FRAME = "no_frame"
     TRUNCATED = "truncated"
     UNKNOWN_ID = "unknown_id"
@@ -74,124 +105,30 @@ class Reject(StrEnum):
     MALFORMED = "malformed"
     BAD_CRC = "bad_crc"
     NON_FINITE = "non_finite"
+    UNSIGNED = "unsigned"
+    BAD_SIGNATURE = "bad_signature"
+    REPLAYED = "replayed"
+    TOO_OLD = "too_old"
+    UNRESERVED = "unreserved"
+    WRONG_LINK = "wrong_link"
+    TOO_NEW = "too_new"
+    TOO_MANY_STREAMS = "too_many_streams"
 
 
-class Severity:
-    """MAV_SEVERITY of a STATUSTEXT."""
+class Seal(Protocol):
+    """Signs and checks the frames of one link (:mod:`autopilot.link.signing`)."""
 
-    ERROR = dialect.MAV_SEVERITY_ERROR
-    WARNING = dialect.MAV_SEVERITY_WARNING
-    NOTICE = dialect.MAV_SEVERITY_NOTICE
-    INFO = dialect.MAV_SEVERITY_INFO
+    def sign(self, frame: bytes) -> bytes:
+        """Return a frame that carries the flag and the checksum already, with its signature."""
 
+    def check(self, frame: bytes) -> StrEnum:
+        """Return ``accepted``, or why not in a word of :class:`Reject`; remember what is accepted."""
 
-@dataclass(frozen=True, slots=True)
-class Heartbeat:
-    """HEARTBEAT: MAV_TYPE, MAV_AUTOPILOT, MAV_MODE_FLAG, custom mode, MAV_STATE."""
+    def would_accept(self, frame: bytes) -> bool:
+        """Return whether a frame is genuine and new, and remember nothing."""
 
-    type: int
-    autopilot: int
-    base_mode: int
-    custom_mode: int
-    system_status: int
-
-
-@dataclass(frozen=True, slots=True)
-class Attitude:
-    """ATTITUDE: milliseconds (u32, wraps), radians, radians per second."""
-
-    time_boot_ms: int
-    roll: float
-    pitch: float
-    yaw: float
-    rollspeed: float
-    pitchspeed: float
-    yawspeed: float
-
-
-@dataclass(frozen=True, slots=True)
-class AoaSsa:
-    """AOA_SSA: microseconds (u64), angle of attack and sideslip in **degrees**."""
-
-    time_usec: int
-    AOA: float
-    SSA: float
-
-
-@dataclass(frozen=True, slots=True)
-class VfrHud:
-    """VFR_HUD: metres per second, degrees, percent, metres; it carries no time."""
-
-    airspeed: float
-    groundspeed: float
-    heading: int
-    throttle: int
-    alt: float
-    climb: float
-
-
-@dataclass(frozen=True, slots=True)
-class ServoOutputRaw:
-    """SERVO_OUTPUT_RAW: microseconds (u32, wraps) of the sample the command used; elevator pulse in microseconds."""
-
-    time_usec: int
-    servo2_raw: int
-
-
-@dataclass(frozen=True, slots=True)
-class HilActuatorControls:
-    """HIL_ACTUATOR_CONTROLS: microseconds (u64) of the sample the command used; controls[1] from -1 to 1."""
-
-    time_usec: int
-    elevator: float
-
-
-@dataclass(frozen=True, slots=True)
-class NamedValueFloat:
-    """NAMED_VALUE_FLOAT: milliseconds (u32, wraps), a name of at most 10 characters, a finite 32-bit float."""
-
-    time_boot_ms: int
-    name: str
-    value: float
-
-
-@dataclass(frozen=True, slots=True)
-class NamedValueInt:
-    """NAMED_VALUE_INT: milliseconds (u32, wraps), a name of at most 10 characters, a signed 32-bit value."""
-
-    time_boot_ms: int
-    name: str
-    value: int
-
-
-@dataclass(frozen=True, slots=True)
-class Timesync:
-    """TIMESYNC: a request has tc1 = 0; the reply echoes ts1 and puts its own time into tc1 (nanoseconds)."""
-
-    tc1: int
-    ts1: int
-
-
-@dataclass(frozen=True, slots=True)
-class StatusText:
-    """STATUSTEXT: MAV_SEVERITY and up to 50 characters."""
-
-    severity: int
-    text: str
-
-
-Message = (
-    Heartbeat
-    | Attitude
-    | AoaSsa
-    | VfrHud
-    | ServoOutputRaw
-    | HilActuatorControls
-    | NamedValueFloat
-    | NamedValueInt
-    | Timesync
-    | StatusText
-)
+    def tick(self, now_ns: int) -> None:
+        """Take the own time."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -284,8 +221,120 @@ _CODECS: dict[type, _Codec] = {
     ),
 }
 
-_BY_ID: dict[int, _Codec] = {codec.native.id: codec for codec in _CODECS.values()}
+
+@dataclass(frozen=True, slots=True)
+class _NewMessage:
+    """A message of the common dialect that pymavlink's ardupilotmega does not have yet: its row of the same tables."""
+
+    id: int
+    crc_extra: int
+    unpacker: struct.Struct
+    ordered_fieldnames: tuple[str, ...]
+    array_lengths: tuple[int, ...]
+
+
+_AVAILABLE_MODES = _NewMessage(
+    435,
+    134,
+    struct.Struct("<IIBBB35s"),
+    ("custom_mode", "properties", "number_modes", "mode_index", "standard_mode", "mode_name"),
+    (0, 0, 0, 0, 0, 35),
+)
+_CURRENT_MODE = _NewMessage(
+    436, 193, struct.Struct("<IIB"), ("custom_mode", "intended_custom_mode", "standard_mode"), (0, 0, 0)
+)
+
+
+def _by_name(message: type, native: Any) -> _Codec:
+    """Return the codec of a message whose fields have the dialect's names; what it lacks is zero on the wire."""
+    places: dict[str, tuple[int, int]] = {}
+    blank: list[Any] = []
+    unpacked = native.unpacker.unpack(bytes(native.unpacker.size))
+    for name, length in zip(native.ordered_fieldnames, native.array_lengths, strict=True):
+        count = 1 if not length or isinstance(unpacked[len(blank)], bytes) else length
+        places[name] = (len(blank), count)
+        blank += unpacked[len(blank) : len(blank) + count]
+    ours = [(each.name, *places[each.name], each.type) for each in fields(message)]
+
+    def values(m: Any) -> tuple[Any, ...]:
+        row = blank.copy()
+        for name, place, count, _ in ours:
+            value = getattr(m, name)
+            if isinstance(value, str):
+                row[place] = value.encode("ascii", "replace")
+            elif count > 1:
+                assert len(value) == count, f"{name}: expected {count} values, found {len(value)}"
+                row[place : place + count] = value
+            else:
+                row[place] = value
+        return tuple(row)
+
+    def parsed(row: tuple[Any, ...]) -> Any:
+        found: list[Any] = []
+        for _, place, count, kind in ours:
+            if kind == "str":
+                found.append(_text(row[place]))
+            elif count > 1:
+                found.append(bytes(row[place : place + count]) if kind == "bytes" else row[place : place + count])
+            else:
+                found.append(row[place])
+        return message(*found)
+
+    return _Codec(native, values, parsed)
+
+
+_GROUND_CODECS: dict[type, _Codec] = {
+    ground.AvailableModes: _by_name(ground.AvailableModes, _AVAILABLE_MODES),
+    ground.CurrentMode: _by_name(ground.CurrentMode, _CURRENT_MODE),
+    **{
+        message: _by_name(message, getattr(dialect, f"MAVLink_{name}_message"))
+        for message, name in (
+            (ground.AttitudeTarget, "attitude_target"),
+            (ground.AutopilotVersion, "autopilot_version"),
+            (ground.CommandAck, "command_ack"),
+            (ground.CommandInt, "command_int"),
+            (ground.CommandLong, "command_long"),
+            (ground.ExtendedSysState, "extended_sys_state"),
+            (ground.FileTransferProtocol, "file_transfer_protocol"),
+            (ground.GlobalPositionInt, "global_position_int"),
+            (ground.HomePosition, "home_position"),
+            (ground.LogEntry, "log_entry"),
+            (ground.LogRequestList, "log_request_list"),
+            (ground.ManualControl, "manual_control"),
+            (ground.MessageInterval, "message_interval"),
+            (ground.MissionAck, "mission_ack"),
+            (ground.MissionClearAll, "mission_clear_all"),
+            (ground.MissionCount, "mission_count"),
+            (ground.MissionRequest, "mission_request"),
+            (ground.MissionRequestInt, "mission_request_int"),
+            (ground.MissionRequestList, "mission_request_list"),
+            (ground.ParamError, "param_error"),
+            (ground.ParamRequestList, "param_request_list"),
+            (ground.ParamRequestRead, "param_request_read"),
+            (ground.ParamSet, "param_set"),
+            (ground.ParamValue, "param_value"),
+            (ground.Ping, "ping"),
+            (ground.RcChannelsOverride, "rc_channels_override"),
+            (ground.RequestDataStream, "request_data_stream"),
+            (ground.SetAttitudeTarget, "set_attitude_target"),
+            (ground.SetMode, "set_mode"),
+            (ground.SysStatus, "sys_status"),
+        )
+    },
+}
+_ALL_CODECS = _CODECS | _GROUND_CODECS
+
+CONTROL_MESSAGES = frozenset(_CODECS)
+"""What autopilot and plant say to each other."""
+GROUND_MESSAGES = frozenset(_GROUND_CODECS) | {Heartbeat, Timesync}
+"""What a vehicle hears from ground stations."""
 _HEADER = struct.Struct("<BBBBBBBHB")
+
+
+def message_id(message: type) -> int:
+    """Return the MAVLink id of a message type."""
+    number: int = _ALL_CODECS[message].native.id
+    return number
 
 
 class Wire:
@@ -297,11 +346,23 @@ class Wire:
         System and component that sign what is packed here.
     peer : (int, int) or None
         System and component whose frames are accepted; None accepts every source but ``source``.
+    accepts : frozenset of type
+        The message types that are parsed.
+    seal : Seal, optional
+        Signs what is packed, and what is parsed must pass it.
     """
 
-    def __init__(self, source: tuple[int, int], peer: tuple[int, int] | None) -> None:
+    def __init__(
+        self,
+        source: Source,
+        peer: Source | None,
+        accepts: frozenset[type] = CONTROL_MESSAGES,
+        seal: Seal | None = None,
+    ) -> None:
         self.source = source
         self.peer = peer
+        self.seal = seal
+        self._by_id = {codec.native.id: codec for message, codec in _ALL_CODECS.items() if message in accepts}
         self.rejects: Counter[Reject] = Counter()
         self.received = 0
         self.sent = 0
@@ -309,7 +370,7 @@ class Wire:
 
     def encode(self, message: Message) -> bytes:
         """Pack one message into one frame with the next sequence number."""
-        codec = _CODECS[type(message)]
+        codec = _ALL_CODECS[type(message)]
         native = codec.native
         payload = native.unpacker.pack(*codec.values(message))
         payload = payload.rstrip(b"\0") or payload[:1]
@@ -317,7 +378,7 @@ class Wire:
         header = _HEADER.pack(
             dialect.PROTOCOL_MARKER_V2,
             len(payload),
-            0,
+            0 if self.seal is None else _SIGNED,
             0,
             self._sequence,
             system,
@@ -328,39 +389,45 @@ class Wire:
         self._sequence = (self._sequence + 1) % 256
         self.sent += 1
         body = header + payload
-        return body + _crc(body[1:], native.crc_extra)
+        frame: bytes = body + _crc(body[1:], native.crc_extra)
+        return frame if self.seal is None else self.seal.sign(frame)
 
     def decode(self, datagram: bytes) -> list[Message]:
         """Return the accepted messages of one datagram, in order; count and drop the rest."""
+        return [message for _, message in self._accepted(datagram)]
+
+    def decode_from(self, datagram: bytes) -> list[tuple[Source, Message]]:
+        """Return the same with who sent each."""
+        return [(_source(frame), message) for frame, message in self._accepted(datagram)]
+
+    def _accepted(self, datagram: bytes) -> Iterator[tuple[bytes, Message]]:
+        """Yield the accepted frames of one datagram with their messages; count the rest."""
         if len(datagram) > MAX_DATAGRAM_BYTES:
             self.rejects[Reject.OVERSIZE] += 1
-            return []
+            return
         frames, leftover = split_frames(datagram)
         if leftover is not None:
             self.rejects[leftover] += 1
-        messages = []
+        if len(frames) > MAX_FRAMES:
+            self.rejects[Reject.EXCESS] += len(frames) - MAX_FRAMES
+            frames = frames[:MAX_FRAMES]
         for frame in frames:
             parsed = self._parse(frame)
             if isinstance(parsed, Reject):
                 self.rejects[parsed] += 1
             else:
-                messages.append(parsed)
-        self.received += len(messages)
-        return messages
+                self.received += 1
+                yield frame, parsed
 
     def _parse(self, frame: bytes) -> Message | Reject:
         """Return one frame's message, or why it is not accepted."""
-        if frame[0] == dialect.PROTOCOL_MARKER_V2:
-            source = (frame[5], frame[6])
-            message_id = int.from_bytes(frame[7:10], "little")
-        else:
-            source = (frame[3], frame[4])
-            message_id = frame[5]
-        if message_id not in dialect.mavlink_map:
+        source = _source(frame)
+        number = int.from_bytes(frame[7:10], "little") if frame[0] == dialect.PROTOCOL_MARKER_V2 else frame[5]
+        codec = self._by_id.get(number)
+        if codec is None and number not in dialect.mavlink_map:
             return Reject.UNKNOWN_ID
         if source != self.peer if self.peer is not None else source == self.source:
             return Reject.WRONG_SOURCE
-        codec = _BY_ID.get(message_id)
         if codec is None:
             return Reject.UNHANDLED
         native = codec.native
@@ -368,6 +435,8 @@ class Wire:
         end = start + frame[1]
         if _crc(frame[1:end], native.crc_extra) != frame[end : end + 2]:
             return Reject.BAD_CRC
+        if self.seal is not None and (verdict := self.seal.check(frame)) != ACCEPTED:
+            return Reject(verdict)
         size = native.unpacker.size
         payload = frame[start:end].ljust(size, b"\0")[:size]  # trailing zeros are not sent; extensions may follow
         message: Message = codec.message(native.unpacker.unpack(payload))
@@ -375,6 +444,11 @@ class Wire:
             if not math.isfinite(getattr(message, name)):
                 return Reject.NON_FINITE
         return message
+
+
+def _source(frame: bytes) -> Source:
+    """Return who sent a frame."""
+    return (frame[5], frame[6]) if frame[0] == dialect.PROTOCOL_MARKER_V2 else (frame[3], frame[4])
 
 
 def _crc(body: bytes, crc_extra: int) -> bytes:
@@ -411,10 +485,19 @@ def split_frames(datagram: bytes) -> tuple[list[bytes], Reject | None]:
     return frames, None
 
 
-def frames_of(source: tuple[int, int]) -> Callable[[bytes], bool]:
-    """Return a test for datagrams that carry a valid frame of ``source``: what a listener latches its peer on."""
+def frames_of(source: Source, seal: Seal | None = None) -> Callable[[bytes], bool]:
+    """Return a test for datagrams that carry a valid frame of ``source``: what a listener latches its peer on.
+
+    With a seal the frame must be one that it would accept, so that nobody becomes the peer by an old frame.
+    """
     wire = Wire((0, 0), source)
-    return lambda datagram: bool(wire.decode(datagram))
+
+    def heard(datagram: bytes) -> bool:
+        if not wire.decode(datagram):
+            return False
+        return seal is None or any(seal.would_accept(frame) for frame in split_frames(datagram)[0])
+
+    return heard
 
 
 def plant_heartbeat() -> Heartbeat:
@@ -422,18 +505,23 @@ def plant_heartbeat() -> Heartbeat:
     return Heartbeat(dialect.MAV_TYPE_FIXED_WING, dialect.MAV_AUTOPILOT_INVALID, 0, 0, dialect.MAV_STATE_ACTIVE)
 
 
-def autopilot_heartbeat(*, tracking: bool, degraded: bool) -> Heartbeat:
+def autopilot_heartbeat(*, armed: bool, custom_mode: int, flags: int, degraded: bool) -> Heartbeat:
     """Return the autopilot's HEARTBEAT.
 
     Parameters
     ----------
-    tracking : bool
-        Whether the control law has the elevator.
+    armed : bool
+        Whether the elevator may leave neutral.
+    custom_mode : int
+        Number of the flight mode.
+    flags : int
+        MAV_MODE_FLAG bits of that mode beside those for armed and for custom modes.
     degraded : bool
-        Whether failsafe has it.
+        Whether failsafe has the elevator.
     """
-    base_mode = dialect.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED | dialect.MAV_MODE_FLAG_SAFETY_ARMED
-    if tracking:
-        base_mode |= dialect.MAV_MODE_FLAG_STABILIZE_ENABLED
-    state = dialect.MAV_STATE_CRITICAL if degraded else dialect.MAV_STATE_ACTIVE
-    return Heartbeat(dialect.MAV_TYPE_FIXED_WING, dialect.MAV_AUTOPILOT_GENERIC, base_mode, 0, state)
+    base_mode = dialect.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED | flags
+    state = dialect.MAV_STATE_STANDBY
+    if armed:
+        base_mode |= dialect.MAV_MODE_FLAG_SAFETY_ARMED
+        state = dialect.MAV_STATE_CRITICAL if degraded else dialect.MAV_STATE_ACTIVE
+    return Heartbeat(dialect.MAV_TYPE_FIXED_WING, dialect.MAV_AUTOPILOT_GENERIC, base_mode, custom_mode, state)

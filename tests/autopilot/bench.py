@@ -7,7 +7,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from autopilot.app import AutopilotConfig, AutopilotNode
+from autopilot.app import AutopilotNode
+from autopilot.config import AutopilotConfig
 from autopilot.link.wire import PLANT, AoaSsa, Attitude, Message, NamedValueInt, Timesync, Wire
 from tests.helpers import HIRM, MS, TS, S, parse
 

@@ -359,7 +359,7 @@ def test_whatever_vfr_hud_says_gamma_is_an_angle_or_none(airspeed: float, climb:
 def flown(aoa: bool) -> tuple[Bench, np.ndarray]:
     """Fly the linear aircraft with a wild elevator into an assembler; return it and the true states."""
     plant, wire = PlantNode(PlantConfig(MODEL, np.array([0.05, 0.0, 0.1]), aoa=aoa)), Wire(AUTOPILOT, None)
-    plant.receive("autopilot", wire.encode(autopilot_heartbeat(tracking=False, degraded=False)), T0)
+    plant.receive("autopilot", wire.encode(autopilot_heartbeat(armed=True, custom_mode=10, flags=28, degraded=False)), T0)
     rng, b, truth = np.random.default_rng(3), Bench("auto"), []
     for k in range(400):
         b.now_ns = T0 + k * TS

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from autopilot.app import AutopilotConfig
+from autopilot.config import AutopilotConfig
 from autopilot.link.wire import AoaSsa, Attitude, NamedValueInt, VfrHud
 from sitl.plant import PlantConfig
 from tests.autopilot.bench import TREMBLE, X0, Bench

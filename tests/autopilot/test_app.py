@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 from scipy.signal import dlsim
 
-from autopilot.app import AutopilotConfig, AutopilotNode
+from autopilot.app import AutopilotNode
+from autopilot.config import AutopilotConfig
 from autopilot.failsafe import Mode
 from autopilot.link.clock import Clock
 from autopilot.link.topics import SCHEMAS
@@ -26,7 +27,7 @@ from autopilot.link.wire import (
     Wire,
     plant_heartbeat,
 )
-from autopilot.reference import Profile, parse_profile
+from autopilot.profile import Profile, parse_profile
 from gains.store import load_gains
 from gains.table import InputError
 from sitl.plant import PlantConfig, PlantNode

@@ -10,10 +10,10 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from autopilot.app import AutopilotConfig
+from autopilot.config import AutopilotConfig
 from autopilot.failsafe import CALM_SAMPLES
 from autopilot.link.clock import Clock
-from autopilot.reference import parse_profile
+from autopilot.profile import parse_profile
 from gains.model import Gains
 from gains.store import load_gains
 from sitl.plant import PlantConfig

@@ -12,12 +12,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from autopilot.app import AutopilotConfig
+from autopilot.config import AutopilotConfig
 from autopilot.failsafe import Event
 from autopilot.link.sensors import sensors_of
 from autopilot.link.wire import AUTOPILOT, PLANT, AoaSsa, Attitude, Wire
 from autopilot.monitors import (
     COMMAND_MEMORY,
+    FROZEN_CHANGE,
     FROZEN_SAMPLES,
     JUMP_RAD,
     JUMP_SAMPLES,
@@ -27,7 +28,7 @@ from autopilot.monitors import (
     Saturation,
     Silence,
 )
-from autopilot.reference import parse_profile
+from autopilot.profile import parse_profile
 from gains.store import load_gains
 from sitl.flight import fly_virtual
 from sitl.scenario import load_scenario
@@ -324,6 +325,44 @@ def test_gaps_in_the_numbers_delay_no_alarm():
     p = monitor()
     said = [p.judge(j, (0.1, 0.0, 0.0)) for j in range(0, 300, 13)]
     assert [s is not None for s in said] == [False] * (FOUND_WITHIN - 1) + [True] * (len(said) - FOUND_WITHIN + 1)
+
+
+def least_miss(row, us) -> np.ndarray:
+    """Return by how much each state of a row misses the model's change at the least, for any input among ``us``."""
+    (numbers, states), trim = zip(*row, strict=True), MODEL.trim
+    held = [x for j, after, x in zip(numbers, numbers[1:], states, strict=False) for _ in range(after - j)]
+    free = sum((MODEL.A - np.eye(3)) @ (np.array(x) - trim.x) for x in held)
+    forced = [len(held) * MODEL.B[:, 0] * (u - trim.u[0]) for u in (min(us), max(us))]
+    off = np.array([free + each - (np.array(states[-1]) - np.array(states[0])) for each in forced])
+    miss = np.where(off[0] * off[1] <= 0.0, 0.0, abs(off).min(axis=0))
+    return miss * FROZEN_SAMPLES / len(held)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_frozen_is_what_its_definition_says_whatever_stands_still_is_lost_or_commanded(seed):
+    rng, p, us = np.random.default_rng(seed), monitor(), [0.0] * (COMMAND_MEMORY + FROZEN_SAMPLES)
+    gust = abs(MODEL.E).sum(axis=1)
+    calm = gust < 0.01 * gust.max()
+    moved = [[i for i in range(3) if i == n or (calm[i] and MODEL.A[i, n])] for n in range(3)]
+    x, j, u, row, stuck, found = (0.02, 0.0, 0.01), 0, 0.0, [], set(), 0
+    for k in range(UNSTICK_SAMPLES):  # no longer: by then what stands still may be believed again
+        if k % 20 == 0:
+            stands, u = rng.random(3) < 0.6, rng.choice([0.0, -0.05, 0.1])
+        x = tuple(float(v if s else v + rng.choice([0.0, 0.0, 0.002])) for v, s in zip(x, stands, strict=True))
+        j += int(rng.integers(1, 4))
+        row = [*row[-FROZEN_SAMPLES:], (j, x)]
+        stuck = {n for n in stuck if row[-2][1][n] == x[n]}
+        still = [n for n in range(3) if len(row) > FROZEN_SAMPLES and len({each[n] for _, each in row}) == 1]
+        if still and any(least_miss(row, us)[i] > FROZEN_CHANGE for n in still for i in moved[n]):
+            least = np.min([least_miss(row[:m] + row[m + 1 :], us) for m in range(len(row))], axis=0)
+            stuck |= {n for n in still if any(least[i] > FROZEN_CHANGE for i in moved[n])}
+        verdict = p.judge(j, x)
+        assert (verdict is not None) == bool(stuck), k
+        found += verdict is not None
+        for _ in range(rng.integers(3)):  # no command, one, or one sent again
+            p.commanded(u)
+            us = [*us[1:], u]
+    assert 0 < found < UNSTICK_SAMPLES
 
 
 def test_a_steady_climb_with_lost_samples_and_a_steady_rate_is_not_frozen():

@@ -1,8 +1,6 @@
-"""The reference model against scipy, and its profile."""
+"""The reference model against scipy, over programmed and streamed references."""
 
 from __future__ import annotations
-
-import math
 
 import numpy as np
 import pytest
@@ -11,8 +9,9 @@ from hypothesis import strategies as st
 from scipy.signal import dlsim
 
 from autopilot import reference as reference_module
-from autopilot.reference import AffineStep, Profile, ReferenceModel, match_reference, parse_profile
-from gains.table import InputError
+from autopilot.profile import MAX_GAP, Profile, Sine
+from autopilot.reference import CHANGES_LIMIT, AffineStep, ReferenceModel, match_reference
+from autopilot.streamed import Streamed
 from tests.helpers import HIRM
 
 quick = settings(deadline=None)
@@ -84,72 +83,68 @@ def test_a_billion_lost_samples_cost_no_time():
     assert np.all(np.isfinite(model.advance(10**9)))
 
 
-# the profile
+# a streamed reference
 
-
-@pytest.mark.parametrize(
-    ("text", "switches"),
-    [
-        ("", ()),
-        (" , ", ()),
-        ("5deg@1s", ((40, math.radians(5.0)),)),
-        ("5deg@1s,0deg@6s", ((40, math.radians(5.0)), (240, 0.0))),
-        (" 5deg@1s , -2.5deg@2s ", ((40, math.radians(5.0)), (80, math.radians(-2.5)))),
-        ("0.1rad@0s", ((0, 0.1),)),
-        ("1@0.075s", ((3, 1.0),)),
-        ("1@0.0751s", ((4, 1.0),)),
-        ("+1e-1@1e1s", ((400, 0.1),)),
-    ],
-)
-def test_profiles_are_read(text, switches):
-    assert parse_profile(text, 0.025).switches == switches
-
-
-@pytest.mark.parametrize(
-    "text",
-    [
-        "5",
-        "5deg",
-        "5deg@",
-        "5deg@1",
-        "@1s",
-        "deg@1s",
-        "5grad@1s",
-        "5deg@-1s",
-        "5deg@1s;0deg@2s",
-        "nan@1s",
-        "inf@1s",
-        "1e999@1s",
-        "1@1e999s",
-        "1-1@1s",
-        "5deg@1s,x",
-        "5 deg@1s",
-    ],
-)
-def test_what_is_no_profile_is_refused(text):
-    with pytest.raises(InputError, match=r'reference ".*": expected VALUE@TIMEs such as 5deg@1s, found'):
-        parse_profile(text, 0.025)
-
-
-@pytest.mark.parametrize("text", ["1@2s,2@1s", "1@1s,2@1s", "1@1.001s,2@1.002s"])
-def test_times_must_rise(text):
-    with pytest.raises(InputError, match="expected rising times"):
-        parse_profile(text, 0.025)
+TARGETS = st.lists(st.tuples(st.integers(1, 80), st.integers(0, 9), st.floats(-1.0, 1.0)), min_size=1, max_size=12)
 
 
 @quick
-@given(st.integers(0, 3_000_000), st.sampled_from([0.004, 0.02, 0.025, 0.03, 1 / 30]))
-def test_a_switch_at_a_samples_own_time_is_that_sample(k, Ts):
-    assert parse_profile(f"1@{k * Ts!r}s", Ts).switches == ((k, 1.0),)
+@given(TARGETS, st.none() | st.floats(1e-3, 0.3), st.floats(-0.05, 0.05))
+def test_over_a_streamed_reference_it_is_eq_8_with_the_promised_r(targets, limit, rate):
+    streamed = Streamed()
+    model = ReferenceModel(REFERENCE, streamed)
+    looked: dict[int, tuple[float, ...]] = {}
+    for gap, samples, target in targets:
+        model.advance(model.k + gap)
+        looked[model.k + samples] = model.ahead(samples)
+        if target < -0.9:
+            streamed.set_rate(rate)
+        else:
+            streamed.set_target(target, limit)
+    xr, r = np.zeros(3), [streamed.r(k) for k in range(model.k + 10)]
+    for k in range(len(r)):
+        if k in looked:
+            np.testing.assert_allclose(looked[k], xr, rtol=1e-10, atol=1e-12)
+        xr = REFERENCE.Ar @ xr + REFERENCE.Br[:, 0] * r[k]
 
 
-@quick
-@given(SWITCHES, st.integers(0, 500), st.integers(1, 100))
-def test_r_is_constant_as_long_as_it_says(profile, k, span):
-    until = profile.constant_until(k, k + span)
-    assert k < until <= k + span
-    assert len({profile.r(i) for i in range(k, until)}) == 1
-    assert until == k + span or until in [start for start, _ in profile.switches]
+@pytest.mark.parametrize("look", [ReferenceModel.ahead, ReferenceModel.step_ahead])
+def test_what_was_looked_ahead_to_is_promised_and_no_more(look):
+    streamed = Streamed()
+    model = ReferenceModel(REFERENCE, streamed)
+    model.advance(10)
+    look(model, 5)
+    streamed.set_target(0.1)
+    assert [streamed.r(k) for k in range(10, 17)] == [0.0] * 5 + [0.1] * 2
+
+
+def test_a_state_that_is_put_elsewhere_goes_on_with_the_promised_r():
+    streamed = Streamed()
+    model = ReferenceModel(REFERENCE, streamed)
+    model.advance(10)
+    model.ahead(5)
+    streamed.set_target(0.1)
+    model.set(np.zeros(3))
+    np.testing.assert_array_equal(model.ahead(5), np.zeros(3))
+    np.testing.assert_allclose(model.ahead(6), REFERENCE.Br[:, 0] * 0.1, rtol=1e-12)
+
+
+@pytest.mark.parametrize("source", [Sine(1.0, 0.2, 0.0, 0.025), Streamed(Sine(1.0, 0.2, 0.0, 0.025))])
+def test_a_billion_lost_samples_of_a_sine_end_at_its_last_value_and_are_counted(source):
+    model = ReferenceModel(REFERENCE, source)
+    at_rest = np.linalg.solve(np.eye(3) - REFERENCE.Ar, REFERENCE.Br[:, 0] * source.r(10**9 - 1))
+    np.testing.assert_allclose(model.advance(10**9), at_rest, rtol=1e-6, atol=1e-12)
+    skipped = source.skipped if isinstance(source, Streamed) else model.skipped
+    assert 10**9 - CHANGES_LIMIT <= skipped <= 10**9 - MAX_GAP
+
+
+def test_a_sine_over_a_gap_that_can_be_walked_is_what_scipy_makes_of_it():
+    sine = Sine(1.0, 0.2, 0.0, 0.025)
+    truth = by_scipy(np.array([sine.r(k) for k in range(3001)]))[3000]
+    for source in (sine, Streamed(sine)):
+        model = ReferenceModel(REFERENCE, source)
+        np.testing.assert_allclose(model.advance(3000), truth, rtol=1e-10, atol=1e-12)
+        assert model.skipped == 0
 
 
 # re-entry

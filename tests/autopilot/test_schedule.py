@@ -8,9 +8,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from autopilot.app import AutopilotConfig
+from autopilot.config import AutopilotConfig
 from autopilot.link.wire import NamedValueInt
-from autopilot.reference import parse_profile
+from autopilot.profile import parse_profile
 from gains.model import Schedule
 from sitl.plant import PlantConfig
 from tests.autopilot.bench import X0, Bench

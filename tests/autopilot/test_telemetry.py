@@ -17,7 +17,7 @@ from autopilot.link.node import Record
 from autopilot.link.record import decode_line, encode_line, schema_of
 from autopilot.link.wire import Message, NamedValueFloat, NamedValueInt
 from autopilot.telemetry import FORECAST_NS, MAX_ROUND_TRIPS, SECOND_NS, DelayTelemetry, Second, record
-from autopilot.vehicle import Vehicle
+from autopilot.ground.vehicle import Vehicle
 from tests.helpers import MS, TS, S, parse
 
 quick = settings(deadline=None, max_examples=50)

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import errno
+import itertools
 import select
 import socket
+from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
@@ -12,7 +14,7 @@ from dataclasses import dataclass, field
 import pytest
 
 from autopilot.link import udp
-from autopilot.link.clock import NS_PER_S, Clock
+from autopilot.link.clock import NS_PER_MS, NS_PER_S, Clock
 from autopilot.link.node import Record
 from autopilot.link.udp import (
     LATCH_SILENCE_NS,
@@ -21,6 +23,7 @@ from autopilot.link.udp import (
     UdpPort,
     dial,
     listen,
+    next_in_turn,
     parse_address,
     true_ns,
 )
@@ -29,6 +32,13 @@ from gains.table import InputError
 HOME = ("127.0.0.1", 0)
 TIMEOUT_S = 5.0
 MAX_PASSES = 60
+BIG_BYTES = 8192
+"""A datagram of which a few hundred fill any receive buffer."""
+
+SAMPLE_NS = 25 * NS_PER_MS
+TICK_PERIOD_NS = 7 * NS_PER_MS
+COST_NS = {"control": 200_000, "ground": 30_000, "tick": 100_000}
+"""How long a node works, in virtual time."""
 
 
 @dataclass
@@ -327,8 +337,7 @@ def test_no_word_from_the_network_about_a_peer_ends_the_driver(peer, code):
 def test_a_flood_on_one_port_does_not_keep_the_control_port_waiting(peer, stranger):
     control, flooded = listen("control", HOME, accept=bool), listen("flooded", HOME, accept=bool)
     node = Probe(deadline_ns=0)
-    flood = 5 * MAX_PER_PASS
-    for _ in range(flood):
+    for _ in range(100):
         stranger.sendto(b"flood", flooded.local)
 
     def each(_number: int) -> None:
@@ -336,9 +345,160 @@ def test_a_flood_on_one_port_does_not_keep_the_control_port_waiting(peer, strang
 
     with closing(UdpDriver(node, [control, flooded], Clock())) as driver:
         driver.run(passes(4, each))
-    order = [port for port, _, _ in node.got]
-    assert order == (["control"] + ["flooded"] * MAX_PER_PASS) * 4
+    assert [port for port, _, _ in node.got] == ["control", "flooded"] * 4
     assert len(node.ticks) == 4
+
+
+def test_what_a_full_receive_buffer_drops_is_counted(peer):
+    port = listen("p", HOME, accept=bool)
+    with closing(port.socket):
+        room = port.socket.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF)
+        sent = 2 * room // BIG_BYTES
+        for _ in range(sent):
+            peer.sendto(bytes(BIG_BYTES), port.local)
+        taken = sum(1 for _ in iter(lambda: port.receive(0), None))
+        assert 0 < taken < sent
+        assert port.overflowed == sent - taken
+
+
+def test_what_the_kernel_does_not_tell_is_unknown_and_not_zero(peer):
+    port = dial("p", peer.getsockname())
+    port.socket.close()
+    assert port.overflowed is None
+
+
+# the order of service, in virtual time
+
+
+@dataclass
+class Queue:
+    """A port without a socket: what comes when."""
+
+    name: str
+    coming: deque[tuple[int, bytes]]
+    socket: None = None
+
+    def ready(self, now_ns: int) -> bool:
+        return bool(self.coming) and self.coming[0][0] <= now_ns
+
+    def receive(self, now_ns: int) -> bytes | None:
+        return self.coming.popleft()[1] if self.ready(now_ns) else None
+
+
+@dataclass
+class World:
+    """Queues, a driver, and a node for which all work takes time; the log says what was done and when it began."""
+
+    queues: list[Queue]
+    control: int = 1
+    period_ns: int = TICK_PERIOD_NS
+    now_ns: int = 0
+    log: list[tuple[str, bytes, int]] = field(default_factory=list)
+    due_ns: int = 0
+
+    def receive(self, port, datagram, now_ns):
+        self.log.append((port, datagram, now_ns))
+        self.now_ns += COST_NS["control" if port.startswith("control") else "ground"]
+
+    def tick(self, now_ns):
+        self.log.append(("tick", b"%d" % self.due_ns, now_ns))
+        self.due_ns += self.period_ns
+        self.now_ns += COST_NS["tick"]
+
+    def next_deadline_ns(self):
+        return self.due_ns
+
+    def outgoing(self):
+        return []
+
+    def records(self):
+        return []
+
+    def fly(self, monkeypatch: pytest.MonkeyPatch, passes: int | None = None) -> None:
+        """Make passes, until nothing is left to come."""
+        monkeypatch.setattr(udp, "true_ns", lambda: self.now_ns)
+        driver = UdpDriver(self, self.queues, Clock(), control=self.control)
+        for made in itertools.count():
+            if made == passes or not any(queue.coming for queue in self.queues):
+                return
+            if not any(queue.ready(self.now_ns) for queue in self.queues):
+                self.now_ns = min(self.due_ns, *(queue.coming[0][0] for queue in self.queues if queue.coming))
+            driver.serve([queue for queue in self.queues if queue.ready(self.now_ns)])
+
+    def served(self) -> list[str]:
+        return [port for port, _, _ in self.log if port != "tick"]
+
+
+def waiting(name: str, count: int) -> Queue:
+    return Queue(name, deque((0, b"waits") for _ in range(count)))
+
+
+def every(name: str, period_ns: int, count: int) -> Queue:
+    """Return a queue to which a datagram comes each period; it holds the time of its coming."""
+    return Queue(name, deque((i * period_ns, b"%d" % (i * period_ns)) for i in range(count)))
+
+
+def test_a_control_datagram_waits_for_one_ground_datagram_and_one_tick_at_the_most(monkeypatch):
+    world = World([every("control", SAMPLE_NS, 12), waiting("gcs0", 10_000)])
+    world.fly(monkeypatch)
+    assert world.served()[0] == "control"
+    assert world.served().count("gcs0") == 10_000
+    comings = [i for i, (port, _, _) in enumerate(world.log) if port == "control"]
+    assert len(comings) == 12
+    for i in comings:
+        _, came, began_ns = world.log[i]
+        assert 0 <= began_ns - int(came) < COST_NS["ground"] + COST_NS["tick"]
+        between = [port for port, _, ns in world.log[:i] if ns > int(came)]
+        assert between.count("gcs0") + between.count("tick") <= 1
+
+
+def test_what_is_due_waits_for_one_ground_datagram_and_what_control_has_at_the_most(monkeypatch):
+    world = World([every("control", SAMPLE_NS, 12), waiting("gcs0", 10_000)])
+    world.fly(monkeypatch)
+    ticks = [(int(due), began_ns) for port, due, began_ns in world.log if port == "tick"]
+    assert [due_ns for due_ns, _ in ticks] == [i * TICK_PERIOD_NS for i in range(len(ticks))]
+    assert ticks[-1][0] > 10_000 * COST_NS["ground"]
+    worst_ns = max(began_ns - due_ns for due_ns, began_ns in ticks)
+    assert 0 < worst_ns <= 2 * COST_NS["ground"] + COST_NS["control"]
+
+
+def test_ground_stations_are_served_in_turn(monkeypatch):
+    world = World([waiting("gcs0", 10_000), waiting("gcs1", 3), waiting("gcs2", 1), waiting("gcs3", 2)], control=0)
+    world.fly(monkeypatch)
+    assert world.served()[:10] == ["gcs0", "gcs1", "gcs2", "gcs3", "gcs0", "gcs1", "gcs3", "gcs0", "gcs1", "gcs0"]
+    assert set(world.served()[10:]) == {"gcs0"}
+
+
+def test_a_station_that_speaks_now_and_then_waits_for_one_datagram_of_each_other(monkeypatch):
+    world = World([every("gcs0", SAMPLE_NS, 12), waiting("gcs1", 10_000), waiting("gcs2", 10_000)], control=0)
+    world.fly(monkeypatch)
+    waits = [began_ns - int(came) for port, came, began_ns in world.log if port == "gcs0"]
+    assert len(waits) == 12
+    assert max(waits) <= 3 * COST_NS["ground"] + COST_NS["tick"]
+
+
+def test_a_flood_at_the_control_port_itself_starves_neither_ground_nor_what_is_due(monkeypatch):
+    world = World([waiting("control", 10_000), waiting("gcs0", 10_000)], period_ns=1)
+    world.fly(monkeypatch, passes=5)
+    one_pass = ["control"] * MAX_PER_PASS + ["gcs0", "tick"]
+    assert [what for what, _, _ in world.log] == one_pass * 5
+
+
+def test_every_control_port_comes_before_any_other(monkeypatch):
+    world = World([waiting("control0", 2), waiting("control1", 2), waiting("gcs0", 2), waiting("gcs1", 1)], control=2)
+    world.fly(monkeypatch)
+    assert world.served() == ["control0"] * 2 + ["control1"] * 2 + ["gcs0", "gcs1", "gcs0"]
+
+
+@pytest.mark.parametrize("count", range(5))
+def test_the_next_in_turn_is_the_first_that_is_ready_of_all_in_order_after_the_last(count):
+    for ready in itertools.product((False, True), repeat=count):
+        for last in range(-1, count):
+            order = [*range(last + 1, count), *range(last + 1)]
+            assert next_in_turn(ready, last) == next((i for i in order if ready[i]), None)
+
+
+# what the node lives on
 
 
 def test_answers_leave_and_the_driver_stops_when_told(peer):

@@ -11,6 +11,7 @@ import statistics
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
@@ -18,6 +19,7 @@ SAMPLES = 400
 WARM_UP = 40
 PERIOD_S = 0.025
 LIMIT = 4.0
+U32 = 0xFFFFFFFF
 
 ECHO = """
 import socket
@@ -48,8 +50,10 @@ class FakePlant:
         assert self.peer is not None
         self.socket.sendto(frame, self.peer)
 
-    def serve(self, until: float, wanted: str | None = None) -> float | None:
-        """Answer until a time, or until a message of the wanted type; return when it came."""
+    def serve(
+        self, until: float, wanted: Callable[[dialect.MAVLink_message], bool] = lambda _message: False
+    ) -> float | None:
+        """Answer until a time, or until a message that is wanted; return when that came."""
         while (left := until - time.perf_counter()) > 0:
             self.socket.settimeout(left)
             try:
@@ -58,11 +62,37 @@ class FakePlant:
                 return None
             at = time.perf_counter()
             message = self.mav.decode(bytearray(data))
-            if message.get_type() == wanted:
+            if wanted(message):
                 return at
             if message.get_type() == "TIMESYNC" and message.tc1 == 0:
                 self.send(self.pack(dialect.MAVLink_timesync_message(time.perf_counter_ns(), message.ts1)))
         return None
+
+    def started(self, patience_s: float = 30.0) -> bool:
+        """Wait for the autopilot's heartbeat, and number the sample of this moment 0."""
+        if self.serve(time.perf_counter() + patience_s, lambda message: message.get_type() == "HEARTBEAT") is None:
+            return False
+        stamp_ms = time.perf_counter_ns() // 1_000_000 & U32
+        self.send(self.pack(dialect.MAVLink_named_value_int_message(stamp_ms, b"SAMPLE_K", 0)))
+        return True
+
+    def ask(self, patience_s: float = 0.02) -> float | None:
+        """Send one sample; return the seconds until its own command came, or None when it did not in time."""
+        stamp_us = time.perf_counter_ns() // 1000
+        attitude = dialect.MAVLink_attitude_message(stamp_us // 1000 & U32, 0.0, 0.01, 0.0, 0.0, 0.001, 0.0)
+        frames = [self.pack(attitude), self.pack(dialect.MAVLink_aoa_ssa_message(stamp_us, 0.5, 0.0))]
+
+        def answers(message: dialect.MAVLink_message) -> bool:
+            if message.get_type() != "SERVO_OUTPUT_RAW":
+                return False
+            behind_us = (stamp_us - message.time_usec) & U32  # the stamp is that of either half: ATTITUDE's is in ms
+            return behind_us < 1000
+
+        sent = time.perf_counter()
+        for frame in frames:
+            self.send(frame)
+        came = self.serve(sent + patience_s, answers)
+        return None if came is None else came - sent
 
 
 def measure() -> list[tuple[str, float, float, str]]:
@@ -79,7 +109,7 @@ def measure() -> list[tuple[str, float, float, str]]:
         assert echo.stdout is not None
         echo_client.connect(("127.0.0.1", int(echo.stdout.readline())))
         echo_client.settimeout(2.0)
-        assert plant.serve(time.perf_counter() + 30.0, "HEARTBEAT") is not None, "the autopilot did not start"
+        assert plant.started(), "the autopilot did not start"
         ours, theirs = _ask_in_turn(plant, echo_client)
     finally:
         for process in (echo, autopilot):
@@ -93,19 +123,11 @@ def measure() -> list[tuple[str, float, float, str]]:
 def _ask_in_turn(plant: FakePlant, echo_client: socket.socket) -> tuple[list[float], list[float]]:
     ours, theirs = [], []
     start = time.perf_counter()
-    plant.send(plant.pack(dialect.MAVLink_named_value_int_message(int(start * 1000) & 0xFFFFFFFF, b"SAMPLE_K", 0)))
     for k in range(SAMPLES + WARM_UP):
         plant.serve(start + k * PERIOD_S)
-        stamp_us = time.perf_counter_ns() // 1000
-        stamp_ms = stamp_us // 1000 & 0xFFFFFFFF
-        attitude = plant.pack(dialect.MAVLink_attitude_message(stamp_ms, 0.0, 0.01, 0.0, 0.0, 0.001, 0.0))
-        air = plant.pack(dialect.MAVLink_aoa_ssa_message(stamp_us, 0.5, 0.0))
-        sent = time.perf_counter()
-        plant.send(attitude)
-        plant.send(air)
-        came = plant.serve(sent + 0.02, "SERVO_OUTPUT_RAW")
-        if came is not None and k >= WARM_UP:
-            ours.append(came - sent)
+        turnaround = plant.ask()
+        if turnaround is not None and k >= WARM_UP:
+            ours.append(turnaround)
         plant.serve(start + (k + 0.5) * PERIOD_S)
         sent = time.perf_counter()
         echo_client.send(b"x" * 40)

@@ -59,7 +59,7 @@ TO_AUTOPILOT = (
     *(NamedValueInt(1000, "DELAY_K", 3), NamedValueInt(1000, "SAMPLE_K", 9)),
 )
 TO_PLANT = (
-    *(autopilot_heartbeat(tracking=True, degraded=False), Timesync(5, 6), Timesync(0, 6)),
+    *(autopilot_heartbeat(armed=True, custom_mode=10, flags=28, degraded=False), Timesync(5, 6), Timesync(0, 6)),
     *(ServoOutputRaw(10**6, 1900), HilActuatorControls(10**6, 1.0)),
 )
 NO_NUMBERS = {

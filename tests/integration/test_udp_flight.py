@@ -8,13 +8,11 @@ from __future__ import annotations
 
 import base64
 import json
-import os
 import re
 import subprocess
 import sys
 from collections import Counter
 from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -28,11 +26,10 @@ from autopilot.link.topics import schema_of
 from gains.store import load_gains, resolve
 from sitl.scenario import load_scenario
 from tests.helpers import parse
+from tests.integration.groundtools import BIN, MavProxy, mavproxy
 from tests.integration.programs import Program, eventually, free_port, program
 from tests.integration.recursion import deviation, tables
 
-BIN = Path(sys.executable).parent
-MAVPROXY = BIN / "mavproxy.py"
 MAVLOGDUMP = BIN / "mavlogdump.py"
 
 SHORT = """
@@ -84,48 +81,6 @@ class Flight:
     def deviation(self) -> float:
         scenario = load_scenario("nominal", gains=str(self.gains))
         return deviation(scenario, *self.truth_and_commands)
-
-
-@dataclass(frozen=True)
-class MavProxy:
-    """MAVProxy without a head: commands on standard input, a transcript on standard output."""
-
-    process: subprocess.Popen[bytes]
-    out: Path
-
-    @property
-    def transcript(self) -> str:
-        return self.out.read_text(errors="replace")
-
-    def say(self, *lines: str) -> None:
-        assert self.process.stdin is not None
-        self.process.stdin.write("".join(f"{line}\n" for line in lines).encode())
-        self.process.stdin.flush()
-
-
-@contextmanager
-def mavproxy(folder: Path, port: int) -> Iterator[MavProxy]:
-    """Run MAVProxy, listening on a port; it is told to exit, and killed."""
-    out = folder / "mavproxy.txt"
-    command = [sys.executable, str(MAVPROXY), "--master", f"udpin:127.0.0.1:{port}", "--no-state", "--nowait"]
-    environment = {**os.environ, "HOME": str(folder)}
-    with (
-        out.open("wb") as stdout,
-        subprocess.Popen(
-            [*command, "--default-modules", ""],
-            stdin=subprocess.PIPE,
-            stdout=stdout,
-            stderr=subprocess.STDOUT,
-            cwd=folder,
-            env=environment,
-        ) as process,
-    ):
-        station = MavProxy(process, out)
-        try:
-            yield station
-            station.say("set requireexit True", "exit")
-        finally:
-            process.kill()
 
 
 def watch(station: MavProxy, flight: Program) -> int:

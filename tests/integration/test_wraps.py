@@ -14,7 +14,8 @@ from functools import cache
 
 import pytest
 
-from autopilot.app import AutopilotConfig, AutopilotNode
+from autopilot.app import AutopilotNode
+from autopilot.config import AutopilotConfig
 from autopilot.envelope import BUCKET_NS
 from autopilot.link.clock import Clock
 from autopilot.link.node import Record

@@ -276,7 +276,7 @@ def test_a_datagram_with_commands_of_several_samples_is_swallowed() -> None:
 
 
 @pytest.mark.parametrize(
-    "message", [Timesync(0, 5), Timesync(5, 6), autopilot_heartbeat(tracking=True, degraded=False)]
+    "message", [Timesync(0, 5), Timesync(5, 6), autopilot_heartbeat(armed=True, custom_mode=10, flags=28, degraded=False)]
 )
 def test_everything_but_commands_is_none_of_its_business(message: Message) -> None:
     b = bench(1)

@@ -32,7 +32,7 @@ from tests.helpers import HIRM, MS, TS, S, broken, parse
 quick = settings(deadline=None)
 MODEL = HIRM.model
 T0 = 137 * S
-HEARTBEAT = autopilot_heartbeat(tracking=False, degraded=False)
+HEARTBEAT = autopilot_heartbeat(armed=True, custom_mode=10, flags=28, degraded=False)
 
 
 @dataclass

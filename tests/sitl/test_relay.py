@@ -190,7 +190,7 @@ def test_with_a_gate_too_every_copy_is_accounted_for(up, down, delays, gaps):
 def test_the_gate_leaves_other_packets_and_their_delay_alone():
     plain, gated = (Flight("delay=3ms", "delay=7ms", gate=gate) for gate in (None, Gate(WITNESS)))
     wire = Wire(AUTOPILOT, PLANT)
-    frames = [wire.encode(message) for message in (Timesync(0, 5), autopilot_heartbeat(tracking=True, degraded=False))]
+    frames = [wire.encode(message) for message in (Timesync(0, 5), autopilot_heartbeat(armed=True, custom_mode=10, flags=28, degraded=False))]
     for flight in (plain, gated):
         for n, payload in enumerate([*frames, b"noise", b""]):
             flight.send("autopilot", payload, n * MS)

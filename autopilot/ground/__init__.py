@@ -1,0 +1,1 @@
+"""The vehicle as ground stations see and command it."""

@@ -1,0 +1,114 @@
+"""How often each message goes to one ground station, as that station has asked.
+
+A message is due at the multiples of its interval of our own clock, so its rate never drifts, messages of equal rate
+leave together, and a late tick is not made up for.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+
+from autopilot.link.clock import NS_PER_S
+from autopilot.link.groundmessages import AttitudeTarget, CurrentMode, ExtendedSysState, GlobalPositionInt, SysStatus
+from autopilot.link.messages import AoaSsa, Attitude, NamedValueFloat, NamedValueInt, ServoOutputRaw, VfrHud
+from autopilot.link.wire import message_id
+
+__all__ = ["GROUPS", "RATE_PARAMETERS", "STREAMED", "Streams", "interval_of"]
+
+RATE_PARAMETERS: Mapping[str, type] = {
+    "RATE_ATT": Attitude,
+    "RATE_HUD": VfrHud,
+    "RATE_AOA": AoaSsa,
+    "RATE_SERVO": ServoOutputRaw,
+    "RATE_DELAY": NamedValueInt,
+    "RATE_EST": NamedValueFloat,
+    "RATE_POS": GlobalPositionInt,
+    "RATE_TARGET": AttitudeTarget,
+    "RATE_SYS": SysStatus,
+}
+"""Which parameter holds the default rate of which message."""
+
+FIXED_RATES: Mapping[type, float] = {CurrentMode: 0.5, ExtendedSysState: 0.0}
+"""Default rates that are no parameters, Hz."""
+
+STREAMED: Mapping[int, type] = {message_id(each): each for each in (*RATE_PARAMETERS.values(), *FIXED_RATES)}
+"""Message id to type of all that can be had at a rate."""
+
+_RAW, _STATUS, _RC, _POSITION, _EXTRA1, _EXTRA2, _EXTRA3 = 1, 2, 3, 6, 10, 11, 12
+GROUPS: Mapping[int, tuple[type, ...]] = {
+    _RAW: (),
+    _STATUS: (SysStatus,),
+    _RC: (ServoOutputRaw,),
+    _POSITION: (GlobalPositionInt,),
+    _EXTRA1: (Attitude, AoaSsa, AttitudeTarget),
+    _EXTRA2: (VfrHud,),
+    _EXTRA3: (NamedValueInt, NamedValueFloat),
+}
+"""MAV_DATA_STREAM to messages, as ArduPilot groups them; 0 is all of these."""
+
+MIN_INTERVAL_NS = NS_PER_S // 100
+"""The fastest stream: 100 Hz. The elevator has the link's time first."""
+
+
+def interval_of(rate_hz: float) -> int | None:
+    """Return the interval of a rate, ns; None for rate 0, which is off."""
+    return None if rate_hz <= 0.0 else max(MIN_INTERVAL_NS, round(NS_PER_S / rate_hz))
+
+
+class Streams:
+    """When each message is due at one ground station.
+
+    Parameters
+    ----------
+    rates : mapping
+        Message type to default rate, Hz; a type that is missing is off.
+    """
+
+    def __init__(self, rates: Mapping[type, float]) -> None:
+        self._defaults = {each: interval_of(rates.get(each, FIXED_RATES.get(each, 0.0))) for each in STREAMED.values()}
+        self._asked: dict[type, int | None] = {}
+        self._due_ns: dict[type, int] = {}
+        self._started = False
+        self.next_ns: int | None = None
+
+    def start(self, now_ns: int) -> None:
+        """Begin to count, at the first multiple of each interval."""
+        self._started = True
+        for message in self._defaults:
+            self._schedule(message, now_ns)
+
+    def interval_ns(self, message: type) -> int | None:
+        """Return the interval in force; None for off."""
+        return self._asked[message] if message in self._asked else self._defaults[message]
+
+    def ask(self, message: type, interval_ns: int | None, now_ns: int) -> None:
+        """Set an interval; None switches the message off."""
+        self._asked[message] = None if interval_ns is None else max(MIN_INTERVAL_NS, interval_ns)
+        self._schedule(message, now_ns)
+
+    def ask_default(self, message: type, now_ns: int) -> None:
+        """Go back to the default."""
+        self._asked.pop(message, None)
+        self._schedule(message, now_ns)
+
+    def set_default(self, message: type, rate_hz: float, now_ns: int) -> None:
+        """Change the default rate; it counts where the station has asked for nothing else."""
+        self._defaults[message] = interval_of(rate_hz)
+        self._schedule(message, now_ns)
+
+    def due(self, now_ns: int) -> Iterable[type]:
+        """Return what is due now, each once, and count on."""
+        if self.next_ns is None or now_ns < self.next_ns:
+            return ()
+        due = [message for message, due_ns in self._due_ns.items() if due_ns <= now_ns]
+        for message in due:
+            self._schedule(message, now_ns)
+        return due
+
+    def _schedule(self, message: type, now_ns: int) -> None:
+        interval_ns = self.interval_ns(message)
+        if not self._started or interval_ns is None:
+            self._due_ns.pop(message, None)
+        else:
+            self._due_ns[message] = (now_ns // interval_ns + 1) * interval_ns
+        self.next_ns = min(self._due_ns.values(), default=None)
