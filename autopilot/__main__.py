@@ -72,7 +72,7 @@ HOME = Parsed("HOME", parse_home)
     show_default=True,
     help='A ground station; may be repeated; "none" for none.',
 )
-@click.option("--reference", default="", help="Pitch reference: 5deg@1s,0deg@6s is 5 degrees at 1 s, 0 at 6 s.")
+@click.option("--reference", default="", help="Pitch reference: 5deg@1s,0deg@6s; or doublet:, 3211:, sine:, file: (README).")
 @click.option(
     "--actuator",
     type=click.Choice(["pwm", "float"]),

@@ -305,6 +305,8 @@ class Pilot:
         if forecast.d is None:
             return Event.OUTSIDE, "delay unknown"
         wide = self.conservative
+        if wide is None and self._clock_known and self._in_window(forecast.d):
+            return Event.GOOD, f"delay {forecast.d}"  # as nearly always, right between a packet in and a packet out
         # before the narrower law is believed in again, the plant's own word counts as much as the forecast
         delays = [forecast.d]
         if wide is not None and self._reported is not None and now_ns - self._reported[1] <= REPORT_NS:

@@ -73,7 +73,7 @@ class Asked(NamedTuple):
     Attributes
     ----------
     p1, p2 : float
-        Its first two parameters; what is not finite is 0.
+        Its first two parameters; what is not finite is 0, where that is a default.
     now_ns : int
         Own time.
     commander : Commander
@@ -104,6 +104,8 @@ def handle(
     current: Callable[[type, int], Iterable[Message]],
 ) -> Handled:
     """Carry out a command that is addressed to us."""
+    if command.command == MavCmd.COMPONENT_ARM_DISARM and not math.isfinite(command.param1):
+        return Handled(MavResult.DENIED)  # the one parameter here that has no default
     p1, p2 = (value if math.isfinite(value) else 0.0 for value in (command.param1, command.param2))
     served = _SERVED.get(command.command)
     if served is None:

@@ -343,18 +343,17 @@ class Vehicle:
                 station.streams.set_default(message, self._values[name], now_ns)
 
     def _sys_status(self, now_ns: int) -> SysStatus:
-        """Return SYS_STATUS; a geofence that is there and content keeps ground stations from asking for one."""
+        """Return SYS_STATUS; MAVProxy takes a geofence that is not healthy for a breach, even where there is none."""
         present = (
             SensorBit.GYRO
             | SensorBit.ANGULAR_RATE_CONTROL
             | SensorBit.ATTITUDE_STABILIZATION
             | SensorBit.MOTOR_OUTPUTS
-            | SensorBit.GEOFENCE
             | SensorBit.AHRS
             | SensorBit.PREARM_CHECK
         )
         health = present if not self.commander.reasons(now_ns) else present & ~SensorBit.PREARM_CHECK
-        bits = int(present), int(present), int(health)
+        bits = int(present), int(present), int(health | SensorBit.GEOFENCE)
         return SysStatus(*bits, 0, NO_BATTERY_MV, NO_BATTERY_CA, NO_BATTERY_PERCENT, 0, 0)
 
     # Sending

@@ -42,12 +42,7 @@ class Clock:
     def true_ns(self, node_ns: int) -> int:
         """Return the earliest true time at which the clock shows at least ``node_ns``."""
         wanted_ns = node_ns - self.offset_ns
-        guess_ns = self.boot_ns + wanted_ns * NS_PER_S // (NS_PER_S + self.drift_ppb)
-        while self.node_ns(guess_ns) < node_ns:
-            guess_ns += 1
-        while self.node_ns(guess_ns - 1) >= node_ns:
-            guess_ns -= 1
-        return guess_ns
+        return self.boot_ns - (-wanted_ns * NS_PER_S // (NS_PER_S + self.drift_ppb))  # rounded up
 
 
 def following(due_ns: int, period_ns: int, now_ns: int) -> int:

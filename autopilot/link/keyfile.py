@@ -5,8 +5,10 @@ a program keeps NAME.PROGRAM.timestamps, one file per program, so that programs 
 other's; only one run of a program may use a key file at a time. Entries are found by port and by a fingerprint
 of the key, so floors of a former key say nothing about the present one, and are still there when it comes back.
 
-The file is replaced as a whole: a temporary file, flushed to the disk, takes its name, then the folder is flushed.
-What is on the disk is therefore always complete, and `signing.py` relies on nothing that is not there yet.
+The file is replaced as a whole: a temporary file takes its name. However the program ends, the file is complete, and
+`signing.py` relies on nothing that is not in it yet. At start and at the end it is also flushed to the disk, in flight
+it is not, because a disk may take longer for that than a sample lasts: after a loss of power, or a crash of the whole
+machine, the floors may be as old as what the system had last written back.
 On Windows neither owner nor mode is checked: access is not expressed by them there.
 """
 
@@ -240,7 +242,7 @@ class TimestampStore:
                 "delete the entries of keys that are out of use"
             )
         self._links[entry] = signing
-        self._write({link: own.ahead() for link, own in self._links.items()})
+        self._write({link: own.ahead() for link, own in self._links.items()}, flush=True)
         if self.failure:
             raise InputError(f"{self.path}: expected a file that can be written, found: {self.failure}")
 
@@ -261,7 +263,7 @@ class TimestampStore:
         self._written_ns = now_ns
         ahead = {entry: link.ahead() for entry, link in self._links.items()}
         if any(self._entries.get(entry) != timestamps for entry, timestamps in ahead.items()):
-            self._write(ahead)
+            self._write(ahead, flush=False)
 
     def close(self) -> None:
         """Write the exact values; no frame may be signed or accepted afterwards."""
@@ -269,14 +271,14 @@ class TimestampStore:
             return
         self._closed = True
         if self._links:
-            self._write({entry: link.exact() for entry, link in self._links.items()})
+            self._write({entry: link.exact() for entry, link in self._links.items()}, flush=True)
 
-    def _write(self, timestamps: dict[_Entry, Timestamps]) -> None:
+    def _write(self, timestamps: dict[_Entry, Timestamps], *, flush: bool) -> None:
         """Write all entries, some of them new, and tell the links what holds now; count a failure."""
         entries = {**self._entries, **timestamps}
         content = tomli_w.dumps({"port": [entry.as_table(of) for entry, of in entries.items()]})
         try:
-            _replace(self.path, content.encode("utf-8"))
+            _replace(self.path, content.encode("utf-8"), flush=flush)
         except OSError as error:
             self.failures += 1
             self.failure = error.strerror or type(error).__name__
@@ -326,20 +328,21 @@ def _read_floors(port: Table) -> dict[Stream, int]:
     return floors
 
 
-def _replace(path: Path, content: bytes) -> None:
-    """Replace a file, which only we can read, at once and so that it stays replaced when the power fails."""
+def _replace(path: Path, content: bytes, *, flush: bool) -> None:
+    """Replace a file, which only we can read, at once; flushed, it stays replaced when the power fails."""
     handle, temporary = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)  # of mode 0600
     try:
         with os.fdopen(handle, "wb") as file:
             file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
+            if flush:
+                file.flush()
+                os.fsync(file.fileno())
         os.replace(temporary, path)
     except BaseException:
         with contextlib.suppress(OSError):
             os.unlink(temporary)
         raise
-    if _POSIX:
+    if flush and _POSIX:
         folder = os.open(path.parent, os.O_RDONLY)
         try:
             os.fsync(folder)

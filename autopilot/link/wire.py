@@ -108,10 +108,11 @@ class Reject(StrEnum):
     UNSIGNED = "unsigned"
     BAD_SIGNATURE = "bad_signature"
     REPLAYED = "replayed"
-    TOO_OLD = "too_old"
-    UNRESERVED = "unreserved"
+    TOO_OLD = "timestamp_too_old"
+    TOO_NEW = "timestamp_too_new"
+    UNRESERVED = "timestamp_unreserved"
     WRONG_LINK = "wrong_link"
-    TOO_NEW = "too_new"
+    MALFORMED_SIGNATURE = "malformed_signature"
     TOO_MANY_STREAMS = "too_many_streams"
 
 

@@ -318,7 +318,7 @@ def test_a_disk_that_fails_in_flight_is_counted_and_stops_no_frame(key_path, mon
     store, signing = run(key_path)
     heard(store, signing, 0)
     with monkeypatch.context() as patch:
-        patch.setattr(keyfile.os, "fsync", _no_space)
+        patch.setattr(keyfile.os, "replace", _no_space)
         signing.tick(100 * S)
         store.pass_(100 * S)
         assert (store.failures, store.failure) == (1, "No space left on device")
@@ -332,12 +332,12 @@ def test_a_disk_that_fails_in_flight_is_counted_and_stops_no_frame(key_path, mon
     assert signing.check(frame(NOW + 900 * 100_000)) is Verdict.UNRESERVED
 
 
-def _no_space(_):
+def _no_space(*_):
     raise OSError(28, os.strerror(28))
 
 
 def test_a_folder_that_cannot_be_written_is_refused_before_the_first_frame(key_path, monkeypatch):
-    monkeypatch.setattr(keyfile.os, "fsync", _no_space)
+    monkeypatch.setattr(keyfile.os, "replace", _no_space)
     with pytest.raises(
         InputError, match=r"autopilot\.timestamps: expected a file that can be written, found: No space"
     ):

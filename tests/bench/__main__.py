@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from rich.console import Console
 from rich.table import Table
 
-from tests.bench import certify, design, estimators, exact, flight, turnaround
+from tests.bench import certify, design, estimators, exact, flight, flood, turnaround
 
 
 @dataclass(frozen=True)
@@ -34,6 +34,7 @@ def main() -> int:
         exact.measure,
         flight.measure,
         turnaround.measure,
+        flood.measure,
     ]
     rows = [Row(*row) for bench in benches for row in bench()]
     table = Table("measured", "ratio", "limit", "", title=f"{platform.machine()}, Python {platform.python_version()}")

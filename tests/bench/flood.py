@@ -15,7 +15,6 @@ A flood ends by itself. As a program (``python -m tests.bench.flood``) this modu
 
 from __future__ import annotations
 
-import json
 import os
 import socket
 import statistics
@@ -23,7 +22,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
@@ -115,12 +114,13 @@ def main(kind: str, port: str, *numbers: str) -> None:
         sock.bind((HOME, int(port)))
         sock.settimeout(windows.seconds + 60.0)
         peer = sock.recvfrom(2048)[1]
-    print(json.dumps(flood(lambda datagram: sock.sendto(datagram, peer), datagrams, rate_hz, windows)))
+    print(flood(lambda datagram: sock.sendto(datagram, peer), datagrams, rate_hz, windows))
 
 
 def make_way() -> None:
-    """Keep this process to the last processor, at ordinary priority, whatever its parent has."""
-    os.sched_setaffinity(0, {(os.cpu_count() or 1) - 1})
+    """Keep this process to the last processor, if it may use that, at ordinary priority, whatever its parent has."""
+    with suppress(OSError):
+        os.sched_setaffinity(0, {(os.cpu_count() or 1) - 1})
     os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
 
 
@@ -205,6 +205,7 @@ def _measure(how: str, *, through_relay: bool) -> list[tuple[str, float, float, 
     plant_port = plant.socket.getsockname()[1]
     length_ns = round(BLOCK * PERIOD_S * NS_PER_S)
     with ExitStack() as stack:
+        stack.callback(plant.socket.close)
         if through_relay:
             stack.enter_context(
                 _running("sitl", "relay", "--listen", f"{HOME}:{relay_port}", "--to", f"{HOME}:{plant_port}")

@@ -12,7 +12,7 @@ import re
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -102,6 +102,11 @@ class Vehicle:
     def flown(self) -> list[tuple[float, float, float]]:
         """Angle of attack, pitch rate and pitch of every sample as the plant knows them, rad, rad/s."""
         return [tuple(body["x"]) for topic, _, body in read_mcap(self.folder / "plant.mcap") if topic == "plant/truth"]
+
+
+def near(seen: float, flown: Iterable[float]) -> bool:
+    """Whether some sample had a value, to what 32-bit floats and degrees leave of it."""
+    return min(abs(seen - value) for value in flown) < 1e-6
 
 
 @contextmanager
