@@ -40,6 +40,8 @@ def expected(mode: str, event: str, conservative: bool = True) -> str:
         return mode  # nothing to fly with
     if event == "restarted":
         return "STANDBY"  # a new aircraft: begin again
+    if event == "released":
+        return "STANDBY"  # disarmed, or a hand has the elevator: nothing that failsafe could hold
     if event == "saturated":
         return mode if mode == "STANDBY" else "NEUTRAL"  # to hold the last command would hold it at the limit
     by_mode = {
@@ -92,9 +94,10 @@ def test_the_sweep_covers_every_pair():
     assert {str(mode) for mode in Mode} == {"STANDBY", "TRACKING", "LEVEL", "CONSERVATIVE", "HOLD", "NEUTRAL"}
     samples = {"good", "wide", "outside", "implausible", "frozen"}
     rows = {"recovered", "calm", "wide_recovered"}
-    others = {"stale", "half", "clock_lost", "saturated", "ground_lost", "ground_back", "expired", "restarted"}
+    others = {"stale", "half", "clock_lost", "saturated", "ground_lost", "ground_back", "expired"}
+    others |= {"restarted", "released"}
     assert {str(e) for e in Event} == samples | rows | others
-    assert len(PAIRS) == 96
+    assert len(PAIRS) == 102
 
 
 def test_every_mode_and_event_says_what_it_means_and_is_found_by_its_word():
@@ -257,6 +260,23 @@ def test_a_saturation_told_again_neither_prolongs_the_rest_nor_breaks_the_row():
 def test_a_restarted_plant_need_not_rest():
     state = run(FailsafeState(Mode.TRACKING), [Event.SATURATED, Event.RESTARTED, Event.GOOD], LIMITS)
     assert state.mode is Mode.TRACKING
+
+
+# the ground's hand
+
+
+@BOTH
+@pytest.mark.parametrize("mode", [mode for mode in Mode if mode is not Mode.STANDBY])
+def test_what_was_released_begins_like_a_new_aircraft_but_remembers_a_lost_ground_station(mode, limits):
+    before = FailsafeState(mode, 1000, 2, 2, resting=True, cautious=True, ground_lost=True)
+    after = step(before, Event.RELEASED, 3000, limits)
+    assert after == FailsafeState(Mode.STANDBY, 3000, ground_lost=True)
+    assert step(after, Event.GOOD, 3001, limits).mode is Mode.LEVEL
+
+
+@BOTH
+def test_a_release_again_in_standby_is_no_change(limits):
+    assert step(FailsafeState(since_ns=1000), Event.RELEASED, 3000, limits) == FailsafeState(since_ns=1000)
 
 
 # the ground station
