@@ -72,7 +72,9 @@ HOME = Parsed("HOME", parse_home)
     show_default=True,
     help='A ground station; may be repeated; "none" for none.',
 )
-@click.option("--reference", default="", help="Pitch reference: 5deg@1s,0deg@6s; or doublet:, 3211:, sine:, file: (README).")
+@click.option(
+    "--reference", default="", help="Pitch reference: 5deg@1s,0deg@6s; or doublet:, 3211:, sine:, file: (README)."
+)
 @click.option(
     "--actuator",
     type=click.Choice(["pwm", "float"]),

@@ -72,6 +72,7 @@ class AutopilotNode:
         self.config = config
         self.model = config.gains.model
         self.proof, self.conservative_proof = _proofs(config.gains)
+        self._seals = tuple(config.seals.values())
         self.wire = Wire(AUTOPILOT, PLANT, seal=config.seals.get(PLANT_PORT))
         self.clock = ClockSync()
         self.delay = DelayEstimator(self.model.Ts_ns)
@@ -114,6 +115,7 @@ class AutopilotNode:
         self._next_heartbeat_ns: int | None = None
         self._next_timesync_ns: int | None = None
         self._next_counters_ns: int | None = None
+        self._periodic_ns = 0
         self._untold: list[Command] = []
 
     @property
@@ -130,7 +132,8 @@ class AutopilotNode:
 
     def receive(self, port: str, datagram: bytes, now_ns: int) -> None:
         """Take one datagram from the plant or from a ground station."""
-        self._tell_time(now_ns)
+        for seal in self._seals:
+            seal.tick(now_ns)
         if port != PLANT_PORT:
             if self.vehicle.receive(port, datagram, now_ns):
                 self.pilot.heard_ground(now_ns)
@@ -151,7 +154,8 @@ class AutopilotNode:
 
     def tick(self, now_ns: int) -> None:
         """Send what is due by time alone: TIMESYNC, heartbeats, failsafe's deadlines, telemetry."""
-        self._tell_time(now_ns)
+        for seal in self._seals:
+            seal.tick(now_ns)
         if self._started_ns is None:
             self._started_ns = self._next_timesync_ns = self._next_counters_ns = now_ns
             self._announce_gains(now_ns)
@@ -174,24 +178,28 @@ class AutopilotNode:
             self._next_counters_ns = following(self._next_counters_ns, COUNTERS_NS, now_ns)
             self._record_counters(now_ns)
             self._tell_missing_half(now_ns)
+        self._periodic_ns = self._next_periodic_ns()
 
     def next_deadline_ns(self) -> int | None:
         """Return when ``tick`` is wanted: at once (0) for the first time, and to tell of a command just sent."""
         if self._started_ns is None or self._untold:
             return 0
-        earliest_ns = self._next_timesync_ns
-        assert earliest_ns is not None
-        for due_ns in (
-            self._next_heartbeat_ns,
-            self._next_counters_ns,
-            self.pilot.next_deadline_ns(),
-            self.telemetry.next_deadline_ns(),
-            self.commander.next_deadline_ns(),
-            self.vehicle.next_deadline_ns(),
-        ):
+        earliest_ns = self._periodic_ns
+        pilot_ns, commander_ns = self.pilot.next_deadline_ns(), self.commander.next_deadline_ns()
+        for due_ns in (pilot_ns, commander_ns, self.vehicle.next_deadline_ns()):
             if due_ns is not None and due_ns < earliest_ns:
                 earliest_ns = due_ns
         return earliest_ns
+
+    def _next_periodic_ns(self) -> int:
+        """Return when something periodic is due; only a tick changes that."""
+        due_ns = (
+            self._next_timesync_ns,
+            self._next_heartbeat_ns,
+            self._next_counters_ns,
+            self.telemetry.next_deadline_ns(),
+        )
+        return min(each for each in due_ns if each is not None)
 
     def outgoing(self) -> list[Datagram]:
         """Take away the datagrams to send, the plant's first."""
@@ -202,10 +210,6 @@ class AutopilotNode:
         """Take away the records."""
         records, self._records = self._records, []
         return records
-
-    def _tell_time(self, now_ns: int) -> None:
-        for seal in self.config.seals.values():
-            seal.tick(now_ns)
 
     # The plant's messages
 

@@ -189,6 +189,8 @@ class Pilot:
         self._last: Sample | None = None
         self._first_j: int | None = None
         self._fresh_ns: int | None = None
+        self._stale_ns: int | None = None
+        """When the state is stale: its age d_max samples, and a little for clocks that differ."""
         self._next_repeat_ns: int | None = None
         self._reported: tuple[int, int] | None = None
         self._clock_known = False
@@ -220,7 +222,7 @@ class Pilot:
             Own time.
         """
         was = self.mode
-        if self._fresh_ns is not None and now_ns - self._fresh_ns > self._stale_ns():
+        if self._stale_ns is not None and now_ns > self._stale_ns:
             self.event(Event.STALE, "a gap before this sample", now_ns)
         if self._clock_known and not clock_known:
             self.event(Event.CLOCK_LOST, "plant clock lost", now_ns)
@@ -238,6 +240,7 @@ class Pilot:
         elif self.mode is not Mode.HOLD:
             self._u, self._saturated = self.travel.neutral, False
         self._idle = not engaged
+        self._stale_ns = now_ns + self._patience * self._Ts_ns + self._Ts_ns // 4
         commander = self._commander
         return Command(
             now_ns,
@@ -289,7 +292,7 @@ class Pilot:
 
     def unready(self, now_ns: int) -> list[str]:
         """Return what keeps the law from flying now, in words; empty when nothing does."""
-        if self._worth_last is None or self._fresh_ns is None or now_ns - self._fresh_ns > self._stale_ns():
+        if self._worth_last is None or self._stale_ns is None or now_ns > self._stale_ns:
             return ["no fresh state"]
         reasons = [] if self._clock_known else ["plant clock not locked"]
         event, reason = self._worth_last
@@ -465,8 +468,7 @@ class Pilot:
         """Return when the present mode ends, or repeats its command, if no sample comes."""
         match self.mode:
             case Mode.TRACKING | Mode.LEVEL | Mode.CONSERVATIVE:
-                assert self._fresh_ns is not None
-                return self._fresh_ns + self._stale_ns()
+                return self._stale_ns
             case Mode.HOLD:
                 return self.failsafe.since_ns + self.limits.hold_ns
             case Mode.NEUTRAL if self.config.failsafe == "on":
@@ -480,10 +482,6 @@ class Pilot:
         if self.mode is Mode.CONSERVATIVE and self.conservative is not None:
             return self.conservative.d_max
         return self.window[1]
-
-    def _stale_ns(self) -> int:
-        """Return the age at which a state is stale: d_max samples, and a little for clocks that differ."""
-        return self._patience * self._Ts_ns + self._Ts_ns // 4
 
     def _in_window(self, d: int) -> bool:
         """Return whether the law may fly at a delay."""

@@ -58,6 +58,7 @@ class ReferenceModel:
         self.source = source
         self.k = 0
         self.skipped = 0
+        self._Br = reference.Br[:, 0]
         self._states: deque[Vector] = deque([np.zeros(reference.Ar.shape[0])])
         """xr(k), xr(k + 1), ...: a state looked ahead to is not computed again."""
 
@@ -88,8 +89,8 @@ class ReferenceModel:
     def ahead(self, samples: int) -> tuple[float, ...]:
         """Return xr(k + samples) without moving the state."""
         while len(self._states) <= samples:
-            at = self.k + len(self._states) - 1
-            self._states.append(self._propagate(self._states[-1], at, at + 1))
+            r = self.source.r(self.k + len(self._states) - 1)
+            self._states.append(self.reference.Ar @ self._states[-1] + self._Br * r)
         return tuple(self._states[samples].tolist())
 
     def step_ahead(self, samples: int) -> AffineStep:
@@ -100,7 +101,7 @@ class ReferenceModel:
 
     def _propagate(self, xr: Vector, start: int, end: int) -> Vector:
         """Return xr(end) from xr(start)."""
-        Ar, Br = self.reference.Ar, self.reference.Br[:, 0]
+        Ar, Br = self.reference.Ar, self._Br
         changes = 0
         while start < end:
             if changes < CHANGES_LIMIT:

@@ -16,6 +16,8 @@ from autopilot.link.messages import VfrHud
 __all__ = ["Position"]
 
 EARTH_RADIUS_M = 6_371_000.0
+MIN_STEP_NS = NS_PER_S // 10
+"""A map needs no finer steps."""
 MAX_GAP_NS = 2 * NS_PER_S
 """A longer gap between two VFR_HUD adds no way."""
 POLE_DEG = 89.0
@@ -39,7 +41,9 @@ class Position:
 
     def flown(self, air: VfrHud, now_ns: int) -> None:
         """Take airspeed, heading, altitude and climb as of now."""
-        if self._air is not None and 0 < now_ns - self._air_ns <= MAX_GAP_NS:
+        if self._air is not None and now_ns - self._air_ns < MIN_STEP_NS:
+            return
+        if self._air is not None and now_ns - self._air_ns <= MAX_GAP_NS:
             way_m = self._air.groundspeed * (now_ns - self._air_ns) / NS_PER_S
             heading = math.radians(self._air.heading)
             north, east = way_m * math.cos(heading), way_m * math.sin(heading)

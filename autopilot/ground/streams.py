@@ -1,12 +1,13 @@
 """How often each message goes to one ground station, as that station has asked.
 
-A message is due at the multiples of its interval of our own clock, so its rate never drifts, messages of equal rate
-leave together, and a late tick is not made up for.
+A message is due at the multiples of its interval of our own clock, so its rate never drifts and messages of equal rate
+leave together. One that is due leaves when there is news of it; what came late by less than an interval does not delay
+the next, so a stream as fast as its source loses nothing to jitter, and what came later is not made up for.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Mapping, Sequence
 
 from autopilot.link.clock import NS_PER_S
 from autopilot.link.groundmessages import AttitudeTarget, CurrentMode, ExtendedSysState, GlobalPositionInt, SysStatus
@@ -62,12 +63,21 @@ class Streams:
     ----------
     rates : mapping
         Message type to default rate, Hz; a type that is missing is off.
+    timed : collection of type
+        Messages that are made when they are due; the others come by themselves, and wake nobody.
+
+    Attributes
+    ----------
+    next_ns : int or None
+        When the next of those that are made is due.
     """
 
-    def __init__(self, rates: Mapping[type, float]) -> None:
+    def __init__(self, rates: Mapping[type, float], timed: Collection[type]) -> None:
         self._defaults = {each: interval_of(rates.get(each, FIXED_RATES.get(each, 0.0))) for each in STREAMED.values()}
+        self._timed = frozenset(timed)
         self._asked: dict[type, int | None] = {}
         self._due_ns: dict[type, int] = {}
+        self._earliest_ns: int | None = None
         self._started = False
         self.next_ns: int | None = None
 
@@ -75,7 +85,7 @@ class Streams:
         """Begin to count, at the first multiple of each interval."""
         self._started = True
         for message in self._defaults:
-            self._schedule(message, now_ns)
+            self._restart(message, now_ns)
 
     def interval_ns(self, message: type) -> int | None:
         """Return the interval in force; None for off."""
@@ -84,31 +94,48 @@ class Streams:
     def ask(self, message: type, interval_ns: int | None, now_ns: int) -> None:
         """Set an interval; None switches the message off."""
         self._asked[message] = None if interval_ns is None else max(MIN_INTERVAL_NS, interval_ns)
-        self._schedule(message, now_ns)
+        self._restart(message, now_ns)
 
     def ask_default(self, message: type, now_ns: int) -> None:
         """Go back to the default."""
         self._asked.pop(message, None)
-        self._schedule(message, now_ns)
+        self._restart(message, now_ns)
 
     def set_default(self, message: type, rate_hz: float, now_ns: int) -> None:
         """Change the default rate; it counts where the station has asked for nothing else."""
+        before = self.interval_ns(message)
         self._defaults[message] = interval_of(rate_hz)
-        self._schedule(message, now_ns)
+        if self.interval_ns(message) != before:
+            self._restart(message, now_ns)
 
-    def due(self, now_ns: int) -> Iterable[type]:
-        """Return what is due now, each once, and count on."""
-        if self.next_ns is None or now_ns < self.next_ns:
+    def due(self, now_ns: int) -> Sequence[type]:
+        """Return what is due now, until it is sent."""
+        if self._earliest_ns is None or now_ns < self._earliest_ns:
             return ()
-        due = [message for message, due_ns in self._due_ns.items() if due_ns <= now_ns]
-        for message in due:
-            self._schedule(message, now_ns)
-        return due
+        return [message for message, due_ns in self._due_ns.items() if due_ns <= now_ns]
 
-    def _schedule(self, message: type, now_ns: int) -> None:
+    def sent(self, message: type, now_ns: int) -> None:
+        """Take note that a message that was due has been sent, or could not be made."""
         interval_ns = self.interval_ns(message)
-        if not self._started or interval_ns is None:
+        assert interval_ns is not None
+        following_ns = self._due_ns[message] + interval_ns
+        self._set(message, following_ns if following_ns + interval_ns > now_ns else _multiple(interval_ns, now_ns))
+
+    def _restart(self, message: type, now_ns: int) -> None:
+        interval_ns = self.interval_ns(message)
+        if self._started:
+            self._set(message, None if interval_ns is None else _multiple(interval_ns, now_ns))
+
+    def _set(self, message: type, due_ns: int | None) -> None:
+        if due_ns is None:
             self._due_ns.pop(message, None)
         else:
-            self._due_ns[message] = (now_ns // interval_ns + 1) * interval_ns
-        self.next_ns = min(self._due_ns.values(), default=None)
+            self._due_ns[message] = due_ns
+        self._earliest_ns = min(self._due_ns.values(), default=None)
+        if message in self._timed:
+            self.next_ns = min((due for each, due in self._due_ns.items() if each in self._timed), default=None)
+
+
+def _multiple(interval_ns: int, after_ns: int) -> int:
+    """Return the first multiple of an interval after a time."""
+    return (after_ns // interval_ns + 1) * interval_ns

@@ -7,10 +7,9 @@ waits for a station, and what one datagram, one station or one tick can cost is 
 
 from __future__ import annotations
 
-from collections import deque
+from collections import defaultdict, deque
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
-from typing import NamedTuple
 
 from autopilot.commander import Commander
 from autopilot.config import Home
@@ -78,16 +77,9 @@ IN_AIR = 2
 """MAV_LANDED_STATE."""
 NO_BATTERY_MV, NO_BATTERY_CA, NO_BATTERY_PERCENT = 65535, -1, -1
 
-Key = tuple[type, str]
-"""A message type, and the name for a named value."""
-
-
-class _Shown(NamedTuple):
-    """The latest message of a kind, when it was, and how many there have been."""
-
-    message: Message
-    at_ns: int
-    number: int
+_NAMED = (NamedValueInt, NamedValueFloat)
+_Shown = tuple[Message, int]
+"""The latest message of a kind, and when it was."""
 
 
 @dataclass(slots=True, eq=False)
@@ -98,7 +90,7 @@ class _Station:
     wire: Wire
     streams: Streams
     waiting: deque[Message] = field(default_factory=deque)
-    seen: dict[Key, int] = field(default_factory=dict)
+    seen: defaultdict[type, dict[str, _Shown]] = field(default_factory=lambda: defaultdict(dict))
     heard: bool = False
     next_parameters_ns: int | None = None
 
@@ -154,10 +146,6 @@ class Vehicle:
         self._storage = storage
         self._values = parameters.values
         rates = {message: self._values[name] for name, message in RATE_PARAMETERS.items()}
-        self._stations = {
-            port: _Station(port, Wire(AUTOPILOT, None, GROUND_MESSAGES, seals.get(port)), Streams(rates))
-            for port in ports
-        }
         self._providers: dict[type, Callable[[int], Message | None]] = {
             SysStatus: self._sys_status,
             GlobalPositionInt: self.position.message,
@@ -166,9 +154,16 @@ class Vehicle:
             ExtendedSysState: lambda _now_ns: ExtendedSysState(0, IN_AIR),
             **providers,
         }
-        self._shown: dict[Key, _Shown] = {}
+        self._stations = {
+            port: _Station(
+                port, Wire(AUTOPILOT, None, GROUND_MESSAGES, seals.get(port)), Streams(rates, self._providers)
+            )
+            for port in ports
+        }
+        self._shown: defaultdict[type, dict[str, _Shown]] = defaultdict(dict)
         self._out: list[Datagram] = []
         self._next_heartbeat_ns: int | None = None
+        self._deadline_ns: int | None = None
 
     @property
     def ports(self) -> tuple[str, ...]:
@@ -184,6 +179,7 @@ class Vehicle:
 
     def receive(self, port: str, datagram: bytes, now_ns: int) -> bool:
         """Take a ground station's datagram; return whether it is one."""
+        self._deadline_ns = None
         station = self._stations[port]
         messages = station.wire.decode_from(datagram)
         if messages and not station.heard:
@@ -252,9 +248,8 @@ class Vehicle:
         """Take note of the latest message of its kind; each station sees it at its rate."""
         if isinstance(message, VfrHud):
             self.position.flown(message, now_ns)
-        key = (type(message), message.name if isinstance(message, NamedValueInt | NamedValueFloat) else "")
-        before = self._shown.get(key)
-        self._shown[key] = _Shown(message, now_ns, 1 if before is None else before.number + 1)
+        name = message.name if isinstance(message, _NAMED) else ""
+        self._shown[type(message)][name] = message, now_ns
 
     def say(self, severity: int, text: str) -> None:
         """Send a STATUSTEXT to every ground station."""
@@ -266,12 +261,13 @@ class Vehicle:
         if provide is not None:
             found = provide(now_ns)
             return () if found is None else (found,)
-        return [_on_our_clock(shown) for key, shown in self._shown.items() if key[0] is message]
+        return [_on_our_clock(shown) for shown in self._shown[message].values()]
 
     # Time
 
     def tick(self, now_ns: int, *, degraded: bool) -> None:
         """Send what is due: what waits, streams, and the heartbeat, with the banner before the first one."""
+        self._deadline_ns = None
         if self._next_heartbeat_ns is None:
             self._next_heartbeat_ns = now_ns
             self._start(now_ns)
@@ -302,9 +298,13 @@ class Vehicle:
 
     def next_deadline_ns(self) -> int | None:
         """Return when ``tick`` is wanted: at once (0) while something waits for a station."""
-        earliest_ns = self._next_heartbeat_ns
-        if earliest_ns is None:
+        if self._next_heartbeat_ns is None:
             return None
+        if self._deadline_ns is None:  # asked for much more often than it changes
+            self._deadline_ns = self._earliest_ns(self._next_heartbeat_ns)
+        return self._deadline_ns
+
+    def _earliest_ns(self, earliest_ns: int) -> int:
         for station in self._stations.values():
             if station.waiting:
                 return 0
@@ -321,13 +321,18 @@ class Vehicle:
     def _stream(self, station: _Station, message: type, now_ns: int) -> None:
         """Send a message of a type if there is news of it."""
         if message in self._providers:
+            station.streams.sent(message, now_ns)
             for found in self.current(message, now_ns):
                 self._send(station, found)
             return
-        for key, shown in self._shown.items():
-            if key[0] is message and station.seen.get(key) != shown.number:
-                station.seen[key] = shown.number
+        seen, news = station.seen[message], False
+        for name, shown in self._shown[message].items():
+            if seen.get(name) is not shown:
+                seen[name] = shown
+                news = True
                 self._send(station, _on_our_clock(shown))
+        if news:
+            station.streams.sent(message, now_ns)
 
     def _send_parameters(self, station: _Station, now_ns: int) -> None:
         for value in self.parameters.next_values(station.port, PARAMETERS_PER_TICK):
@@ -365,6 +370,7 @@ class Vehicle:
     def _wait(self, station: _Station, message: Message) -> None:
         if len(station.waiting) < MAX_WAITING:
             station.waiting.append(message)
+            self._deadline_ns = None
         else:
             self.refused += 1
 
@@ -399,7 +405,7 @@ def _request_data_stream(streams: Streams, asked: RequestDataStream, now_ns: int
 
 def _on_our_clock(shown: _Shown) -> Message:
     """Return a message with the time at which it was shown."""
-    message, at_ns, _ = shown
+    message, at_ns = shown
     match message:
         case Attitude(_, roll, pitch, yaw, rollspeed, pitchspeed, yawspeed):
             return Attitude(at_ns // NS_PER_MS, roll, pitch, yaw, rollspeed, pitchspeed, yawspeed)

@@ -93,7 +93,9 @@ SCHEMAS: Mapping[str, Mapping[str, Any]] = MappingProxyType(
             d_probability=_field("number", "Probability of [d_low, d_high], 0 to 1; null if unknown.", nullable=True),
             status=_field("string", "Status of the delay estimate."),
             mode=_field("string", "Mode of the failsafe."),
-            flight_mode=_field("string", "Flight mode that the ground has asked for: MANUAL, STABILIZE, AUTO or GUIDED."),
+            flight_mode=_field(
+                "string", "Flight mode that the ground has asked for: MANUAL, STABILIZE, AUTO or GUIDED."
+            ),
             armed=_field("boolean", "The vehicle is armed; else the elevator stays neutral."),
             gain_set=_field(
                 "integer",

@@ -27,10 +27,12 @@ from dataclasses import dataclass, field
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
-from tests.bench.turnaround import PERIOD_S, WARM_UP, FakePlant
+from tests.bench.turnaround import PERIOD_S, FakePlant
 
 STRANGER_HZ = 20_000
 STATION_HZ = 2_000
+WARM_UP = 120
+"""Samples before the first block; the programs that flood load meanwhile."""
 BLOCK = 40
 """Samples in a row that are quiet, or flooded."""
 BLOCKS = 12
@@ -218,9 +220,8 @@ def _measure(how: str, *, through_relay: bool) -> list[tuple[str, float, float, 
         assert plant.peer is not None
         if os.sched_getscheduler(0) == os.SCHED_RR:
             os.sched_setparam(0, os.sched_param(MEASURED_PRIORITY + 1))  # who measures does not wait for the measured
-        start = time.perf_counter() + 2.0  # the floods load meanwhile
-        offset_s = (WARM_UP + BLOCK - 0.5) * PERIOD_S
-        numbers = [str(n) for n in (round((start + offset_s) * NS_PER_S), length_ns, 2 * length_ns, BLOCKS)]
+        first_ns = round((plant.start + (WARM_UP + BLOCK - 0.5) * PERIOD_S) * NS_PER_S)
+        numbers = [str(n) for n in (first_ns, length_ns, 2 * length_ns, BLOCKS)]
         floods = {
             who: stack.enter_context(_running("tests.bench.flood", who, str(port), str(rate_hz), *numbers))
             for who, port, rate_hz in (
@@ -228,19 +229,17 @@ def _measure(how: str, *, through_relay: bool) -> list[tuple[str, float, float, 
                 ("station", station_port, STATION_HZ),
             )
         }
-        measured = _ask(plant, start)
+        measured = _ask(plant)
         for who, process in floods.items():
             measured.sent_hz[who] = int(process.communicate(timeout=30.0)[0]) / (BLOCKS * BLOCK * PERIOD_S)
     return measured.rows("flooded relay and autopilot" if through_relay else "flooded autopilot", how)
 
 
-def _ask(plant: FakePlant, start: float) -> Measured:
+def _ask(plant: FakePlant) -> Measured:
     """Ask for one command per sample, quiet and flooded blocks in turn."""
     measured = Measured()
-    plant.serve(start)
     for k in range(WARM_UP + 2 * BLOCKS * BLOCK):
-        plant.serve(start + k * PERIOD_S)
-        turnaround = plant.ask()
+        turnaround = plant.ask(k)
         if k < WARM_UP:
             continue
         flooded = (k - WARM_UP) // BLOCK % 2 == 1

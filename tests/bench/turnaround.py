@@ -33,13 +33,14 @@ while True:
 
 
 class FakePlant:
-    """Answers TIMESYNC and counts the replies to samples, over one socket, as system 1, component 25."""
+    """Sends samples, on a grid as a plant does, and answers TIMESYNC, over one socket, as system 1, component 25."""
 
     def __init__(self) -> None:
         self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self.socket.bind(("127.0.0.1", 0))
         self.mav = dialect.MAVLink(None, 1, 25)
         self.peer: tuple[str, int] | None = None
+        self.start = 0.0
 
     def pack(self, message: dialect.MAVLink_message) -> bytes:
         frame: bytes = message.pack(self.mav)
@@ -69,16 +70,17 @@ class FakePlant:
         return None
 
     def started(self, patience_s: float = 30.0) -> bool:
-        """Wait for the autopilot's heartbeat, and number the sample of this moment 0."""
+        """Wait for the autopilot's heartbeat; sample 0 is that of this moment."""
         if self.serve(time.perf_counter() + patience_s, lambda message: message.get_type() == "HEARTBEAT") is None:
             return False
-        stamp_ms = time.perf_counter_ns() // 1_000_000 & U32
-        self.send(self.pack(dialect.MAVLink_named_value_int_message(stamp_ms, b"SAMPLE_K", 0)))
+        self.start = time.perf_counter()
+        self.send(self.pack(dialect.MAVLink_named_value_int_message(int(self.start * 1000) & U32, b"SAMPLE_K", 0)))
         return True
 
-    def ask(self, patience_s: float = 0.02) -> float | None:
-        """Send one sample; return the seconds until its own command came, or None when it did not in time."""
-        stamp_us = time.perf_counter_ns() // 1000
+    def ask(self, k: int, patience_s: float = 0.02) -> float | None:
+        """Send sample k in its time; return the seconds until its own command came, or None when it did not."""
+        self.serve(self.start + k * PERIOD_S)
+        stamp_us = int((self.start + k * PERIOD_S) * 1e6)
         attitude = dialect.MAVLink_attitude_message(stamp_us // 1000 & U32, 0.0, 0.01, 0.0, 0.0, 0.001, 0.0)
         frames = [self.pack(attitude), self.pack(dialect.MAVLink_aoa_ssa_message(stamp_us, 0.5, 0.0))]
 
@@ -122,13 +124,11 @@ def measure() -> list[tuple[str, float, float, str]]:
 
 def _ask_in_turn(plant: FakePlant, echo_client: socket.socket) -> tuple[list[float], list[float]]:
     ours, theirs = [], []
-    start = time.perf_counter()
     for k in range(SAMPLES + WARM_UP):
-        plant.serve(start + k * PERIOD_S)
-        turnaround = plant.ask()
+        turnaround = plant.ask(k)
         if turnaround is not None and k >= WARM_UP:
             ours.append(turnaround)
-        plant.serve(start + (k + 0.5) * PERIOD_S)
+        plant.serve(plant.start + (k + 0.5) * PERIOD_S)
         sent = time.perf_counter()
         echo_client.send(b"x" * 40)
         echo_client.recv(2048)
