@@ -378,7 +378,8 @@ class Pilot:
             case Programmed():
                 if self._program is None or self._program[0] is not target:
                     self._program = target, 0 if first else source.horizon + 1
-                source.set_source(Shifted(self.config.profile, self._program[1]), max_rate)
+                start, profile = self._program[1], self.config.profile
+                source.set_source(Shifted(profile, start) if start else profile, max_rate)
 
     def shape(self, max_pitch: float | None, max_rate: float | None) -> None:
         """Limit the pitch reference, rad from trim, and its change, rad per sample; None for no limit."""

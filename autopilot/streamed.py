@@ -106,6 +106,8 @@ class Streamed:
     def forget(self, before: int) -> None:
         """Drop what was promised for the samples before ``before``; they cannot be asked for again."""
         self._first = max(self._first, before)
+        if len(self._starts) == 1:
+            return
         del self._starts[: (past := max(0, bisect_right(self._starts, before) - 1))], self._values[:past]
 
     def _piece(self, k: int) -> int:
@@ -145,7 +147,8 @@ class Streamed:
         if self._rate is not None:
             until = end if value == before else k + 1
         else:  # arrived, or not able to move: the same for as long as the target stays
-            until = self._source.constant_until(k, end) if value in (target, before) else k + 1
+            settled = end > k + 1 and value in (target, before)
+            until = self._source.constant_until(k, end) if settled else k + 1
         if target != wanted:
             self.limited += until - k
         return value, until

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
-from pymavlink.dialects.v20 import ardupilotmega as dialect
+from pymavlink.dialects.v20 import all as dialect  # ardupilotmega has no CURRENT_MODE
 
 from autopilot.app import AutopilotNode
 from autopilot.config import AutopilotConfig

@@ -77,7 +77,6 @@ class Streams:
         self._timed = frozenset(timed)
         self._asked: dict[type, int | None] = {}
         self._due_ns: dict[type, int] = {}
-        self._earliest_ns: int | None = None
         self._started = False
         self.next_ns: int | None = None
 
@@ -108,11 +107,16 @@ class Streams:
         if self.interval_ns(message) != before:
             self._restart(message, now_ns)
 
-    def due(self, now_ns: int) -> Sequence[type]:
-        """Return what is due now, until it is sent."""
-        if self._earliest_ns is None or now_ns < self._earliest_ns:
+    def is_due(self, message: type, now_ns: int) -> bool:
+        """Return whether a message is due now, which it is until it is sent."""
+        due_ns = self._due_ns.get(message)
+        return due_ns is not None and due_ns <= now_ns
+
+    def to_make(self, now_ns: int) -> Sequence[type]:
+        """Return what must be made now, as it is due."""
+        if self.next_ns is None or now_ns < self.next_ns:
             return ()
-        return [message for message, due_ns in self._due_ns.items() if due_ns <= now_ns]
+        return [message for message in self._timed if self.is_due(message, now_ns)]
 
     def sent(self, message: type, now_ns: int) -> None:
         """Take note that a message that was due has been sent, or could not be made."""
@@ -131,7 +135,6 @@ class Streams:
             self._due_ns.pop(message, None)
         else:
             self._due_ns[message] = due_ns
-        self._earliest_ns = min(self._due_ns.values(), default=None)
         if message in self._timed:
             self.next_ns = min((due for each, due in self._due_ns.items() if each in self._timed), default=None)
 

@@ -90,6 +90,7 @@ class _Station:
     wire: Wire
     streams: Streams
     waiting: deque[Message] = field(default_factory=deque)
+    news: set[type] = field(default_factory=set)
     seen: defaultdict[type, dict[str, _Shown]] = field(default_factory=lambda: defaultdict(dict))
     heard: bool = False
     next_parameters_ns: int | None = None
@@ -249,7 +250,10 @@ class Vehicle:
         if isinstance(message, VfrHud):
             self.position.flown(message, now_ns)
         name = message.name if isinstance(message, _NAMED) else ""
-        self._shown[type(message)][name] = message, now_ns
+        kind = type(message)
+        self._shown[kind][name] = message, now_ns
+        for station in self._stations.values():
+            station.news.add(kind)
 
     def say(self, severity: int, text: str) -> None:
         """Send a STATUSTEXT to every ground station."""
@@ -289,8 +293,14 @@ class Vehicle:
 
     def _tick_station(self, station: _Station, now_ns: int) -> None:
         """Send one station what it is due, so much at once that no other waits long."""
-        for message in station.streams.due(now_ns):
-            self._stream(station, message, now_ns)
+        streams = station.streams
+        for message in streams.to_make(now_ns):
+            streams.sent(message, now_ns)
+            for found in self.current(message, now_ns):
+                self._send(station, found)
+        for message in [each for each in station.news if streams.is_due(each, now_ns)]:
+            streams.sent(message, now_ns)
+            self._send_news(station, message)
         if station.next_parameters_ns is not None and now_ns >= station.next_parameters_ns:
             self._send_parameters(station, now_ns)
         for _ in range(min(MAX_PER_TICK, len(station.waiting))):
@@ -318,21 +328,14 @@ class Vehicle:
         mode = commander.mode
         return autopilot_heartbeat(armed=commander.armed, custom_mode=mode, flags=mode.flags, degraded=degraded)
 
-    def _stream(self, station: _Station, message: type, now_ns: int) -> None:
-        """Send a message of a type if there is news of it."""
-        if message in self._providers:
-            station.streams.sent(message, now_ns)
-            for found in self.current(message, now_ns):
-                self._send(station, found)
-            return
-        seen, news = station.seen[message], False
+    def _send_news(self, station: _Station, message: type) -> None:
+        """Send what a station has not seen of a type: the latest, or the latest of each name."""
+        station.news.discard(message)
+        seen = station.seen[message]
         for name, shown in self._shown[message].items():
             if seen.get(name) is not shown:
                 seen[name] = shown
-                news = True
                 self._send(station, _on_our_clock(shown))
-        if news:
-            station.streams.sent(message, now_ns)
 
     def _send_parameters(self, station: _Station, now_ns: int) -> None:
         for value in self.parameters.next_values(station.port, PARAMETERS_PER_TICK):

@@ -15,7 +15,7 @@ from __future__ import annotations
 import math
 import struct
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, fields
 from enum import StrEnum
 from typing import Any, Protocol
@@ -395,35 +395,37 @@ class Wire:
 
     def decode(self, datagram: bytes) -> list[Message]:
         """Return the accepted messages of one datagram, in order; count and drop the rest."""
-        return [message for _, message in self._accepted(datagram)]
+        return [message for _, message in self.decode_from(datagram)]
 
     def decode_from(self, datagram: bytes) -> list[tuple[Source, Message]]:
         """Return the same with who sent each."""
-        return [(_source(frame), message) for frame, message in self._accepted(datagram)]
-
-    def _accepted(self, datagram: bytes) -> Iterator[tuple[bytes, Message]]:
-        """Yield the accepted frames of one datagram with their messages; count the rest."""
         if len(datagram) > MAX_DATAGRAM_BYTES:
             self.rejects[Reject.OVERSIZE] += 1
-            return
+            return []
         frames, leftover = split_frames(datagram)
         if leftover is not None:
             self.rejects[leftover] += 1
         if len(frames) > MAX_FRAMES:
             self.rejects[Reject.EXCESS] += len(frames) - MAX_FRAMES
             frames = frames[:MAX_FRAMES]
+        accepted = []
         for frame in frames:
             parsed = self._parse(frame)
             if isinstance(parsed, Reject):
                 self.rejects[parsed] += 1
             else:
-                self.received += 1
-                yield frame, parsed
+                accepted.append(parsed)
+        self.received += len(accepted)
+        return accepted
 
-    def _parse(self, frame: bytes) -> Message | Reject:
-        """Return one frame's message, or why it is not accepted."""
-        source = _source(frame)
-        number = int.from_bytes(frame[7:10], "little") if frame[0] == dialect.PROTOCOL_MARKER_V2 else frame[5]
+    def _parse(self, frame: bytes) -> tuple[Source, Message] | Reject:
+        """Return who sent a frame and its message, or why it is not accepted."""
+        if frame[0] == dialect.PROTOCOL_MARKER_V2:
+            source, number = (frame[5], frame[6]), int.from_bytes(frame[7:10], "little")
+            start = dialect.HEADER_LEN_V2
+        else:
+            source, number = (frame[3], frame[4]), frame[5]
+            start = dialect.HEADER_LEN_V1
         codec = self._by_id.get(number)
         if codec is None and number not in dialect.mavlink_map:
             return Reject.UNKNOWN_ID
@@ -432,7 +434,6 @@ class Wire:
         if codec is None:
             return Reject.UNHANDLED
         native = codec.native
-        start = dialect.HEADER_LEN_V2 if frame[0] == dialect.PROTOCOL_MARKER_V2 else dialect.HEADER_LEN_V1
         end = start + frame[1]
         if _crc(frame[1:end], native.crc_extra) != frame[end : end + 2]:
             return Reject.BAD_CRC
@@ -444,12 +445,7 @@ class Wire:
         for name in codec.floats:
             if not math.isfinite(getattr(message, name)):
                 return Reject.NON_FINITE
-        return message
-
-
-def _source(frame: bytes) -> Source:
-    """Return who sent a frame."""
-    return (frame[5], frame[6]) if frame[0] == dialect.PROTOCOL_MARKER_V2 else (frame[3], frame[4])
+        return source, message
 
 
 def _crc(body: bytes, crc_extra: int) -> bytes:

@@ -8,12 +8,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from pymavlink.dialects.v20 import ardupilotmega as dialect
 from scipy.signal import dlsim
 
 from autopilot.app import AutopilotNode
 from autopilot.config import AutopilotConfig
 from autopilot.failsafe import Mode
 from autopilot.link.clock import Clock
+from autopilot.link.groundmessages import CommandLong
 from autopilot.link.topics import SCHEMAS
 from autopilot.link.wire import (
     AUTOPILOT,
@@ -533,18 +535,38 @@ def test_counters_that_wrap_in_flight_are_not_noticed(wrap_ns):
 # ground stations
 
 
-def test_a_station_sees_what_the_plant_says_as_the_autopilot_on_its_clock():
-    flight = Flight(AutopilotConfig(HIRM, STEP), PlantConfig(HIRM.model, X0)).fly(4 * S)
-    seen = {}
+def seen_by_station(flight: Flight) -> dict[str, list]:
+    """Return what a station got, by type: our time and message."""
+    seen: dict[str, list] = {}
     for t_ns, m in flight.sent("autopilot", "gcs0"):
         assert (m.get_srcSystem(), m.get_srcComponent()) == AUTOPILOT
-        seen.setdefault(m.get_type(), []).append((t_ns, m))
-    commands = flight.bodies("autopilot/command")
-    for kind in ("ATTITUDE", "AOA_SSA", "SERVO_OUTPUT_RAW"):
-        assert len(seen[kind]) == len(commands)
-    for command, (t_ns, m) in zip(commands, seen["ATTITUDE"], strict=True):
-        assert m.pitch == pytest.approx(command["x"][2], rel=1e-6, abs=1e-9)
-        assert m.time_boot_ms == AUTOPILOT_CLOCK.node_ns(t_ns) // MS
+        seen.setdefault(m.get_type(), []).append((AUTOPILOT_CLOCK.node_ns(t_ns), m))
+    return seen
+
+
+def test_a_station_sees_what_the_plant_says_as_the_autopilot_on_its_clock():
+    flight = Flight(AutopilotConfig(HIRM, STEP), PlantConfig(HIRM.model, X0)).fly(4 * S)
+    seen = seen_by_station(flight)
+    commands = [(r.t_ns, r.body) for r in flight.records("autopilot/command")]
+    pulses = [m.servo2_raw for _, m in flight.sent("autopilot", "plant") if m.get_type() == "SERVO_OUTPUT_RAW"]
+    by_ms = {at_ns // MS: (body, pulse) for (at_ns, body), pulse in zip(commands, pulses, strict=True)}
+    for kind, hz in (("ATTITUDE", 20), ("AOA_SSA", 10), ("SERVO_OUTPUT_RAW", 10)):
+        slots = [now_ns * hz // S for now_ns, _ in seen[kind]]
+        assert slots == list(range(slots[0], slots[0] + len(slots))), kind
+        assert len(slots) >= (commands[-1][0] - commands[0][0]) * hz // S
+        for now_ns, m in seen[kind]:
+            stamp_ms = m.time_boot_ms if kind == "ATTITUDE" else (m.time_usec // 1000)
+            newest_ms = max(ms for ms in by_ms if ms <= now_ns // MS)
+            assert stamp_ms == newest_ms
+            body, pulse = by_ms[newest_ms]
+            match kind:
+                case "ATTITUDE":
+                    assert m.pitch == pytest.approx(body["x"][2], rel=1e-6, abs=1e-9)
+                    assert m.pitchspeed == pytest.approx(body["x"][1], rel=1e-6, abs=1e-9)
+                case "AOA_SSA":
+                    assert math.radians(m.AOA) == pytest.approx(body["x"][0], rel=1e-6, abs=1e-9)
+                case _:
+                    assert m.servo2_raw == pulse
     assert {m.name for _, m in seen["NAMED_VALUE_INT"]} == {"DELAY_K", "D_EST", "D_LOW", "D_HIGH", "D_MAX"}
     assert "VFR_HUD" in seen
     assert "TIMESYNC" not in seen
@@ -552,8 +574,96 @@ def test_a_station_sees_what_the_plant_says_as_the_autopilot_on_its_clock():
 
 def test_a_station_is_not_shown_an_old_attitude_as_a_new_one():
     flight = Flight(up=cut(10 * MS, (4, 7))).fly(7 * S)
-    shown = [t_ns for t_ns, m in flight.sent("autopilot", "gcs0") if m.get_type() in ("ATTITUDE", "AOA_SSA")]
-    assert max(shown) < 4 * S + TS
+    seen = seen_by_station(flight)
+    last_ns = max(r.t_ns for r in flight.records("autopilot/command"))
+    assert last_ns < AUTOPILOT_CLOCK.node_ns(4 * S + TS)
+    for kind, stamp, unit_ns in (("ATTITUDE", "time_boot_ms", MS), ("AOA_SSA", "time_usec", 1000)):
+        stamps = [getattr(m, stamp) * unit_ns for _, m in seen[kind]]
+        assert stamps == sorted(set(stamps))
+        assert last_ns - 4 * TS < stamps[-1] <= last_ns
+        assert all(0 <= now_ns - stamp_ns < TS for (now_ns, _), stamp_ns in zip(seen[kind], stamps, strict=True))
+
+
+def test_the_reference_that_is_flown_is_shown_and_no_attitude_while_no_law_flies():
+    flight = Flight(AutopilotConfig(HIRM, STEP), up=cut(10 * MS, (4, 7))).fly(9 * S)
+    ignored = dialect.ATTITUDE_TARGET_TYPEMASK_ATTITUDE_IGNORE
+    shown = [(t_ns, m) for t_ns, m in flight.sent("autopilot", "gcs0") if m.get_type() == "ATTITUDE_TARGET"]
+    flying = [m for t_ns, m in shown if LEARNT <= t_ns < 4 * S or t_ns >= 8 * S]
+    assert len(flying) == 10
+    for m in flying:
+        assert not m.type_mask & ignored
+        assert 2 * math.asin(m.q[2]) == pytest.approx(HIRM.model.trim.x[2] + math.radians(5.0), abs=1e-6)
+    silent = [m for t_ns, m in shown if 4 * S + (D_MAX + 2) * TS < t_ns < 7 * S]
+    assert len(silent) == 14
+    assert all(m.type_mask & ignored for m in silent)
+
+
+# armed and disarmed
+
+
+def beats(b: Bench) -> list[tuple[int, bool]]:
+    """Return custom mode and armed bit of each heartbeat that the station got."""
+    own = [m for port, m in b.messages if (port, m.get_type()) == ("gcs0", "HEARTBEAT")]
+    return [(m.custom_mode, bool(m.base_mode & dialect.MAV_MODE_FLAG_SAFETY_ARMED)) for m in own]
+
+
+STATION = Wire((255, 190), None)
+
+
+def ask(b: Bench, command: int, *params: float) -> list[int]:
+    """Send a command as a station does, and return the results that were acknowledged."""
+    seen = len(b.messages)
+    asked = CommandLong(1, 1, command, 0, *params, *[0.0] * (7 - len(params)))
+    b.node.receive("gcs0", STATION.encode(asked), b.now_ns)
+    b.to(b.now_ns)
+    return [m.result for port, m in b.messages[seen:] if (port, m.get_type()) == ("gcs0", "COMMAND_ACK")]
+
+
+ARM_DISARM, FORCE = dialect.MAV_CMD_COMPONENT_ARM_DISARM, 21196.0
+
+
+def test_by_default_the_vehicle_arms_itself_once_with_the_first_good_sample():
+    b = Bench()
+    b.to(b.now_ns + S)
+    assert beats(b)[-1] == (10, False)
+    b.sample(0)
+    b.sample(1)
+    assert [(c["mode"], c["armed"], c["flight_mode"]) for c in b.commands] == [("TRACKING", True, "AUTO")] * 2
+    assert b.texts().count("armed without a verified certificate") == 1
+    assert ask(b, ARM_DISARM, 0.0) == [dialect.MAV_RESULT_ACCEPTED]
+    for k in range(2, 50):
+        b.sample(k)
+    assert {(c["mode"], c["armed"], c["u"][0]) for c in b.commands[2:]} == {("STANDBY", False, 0.0)}
+    assert beats(b)[-1] == (10, False)
+    assert b.transitions()[-1] == "TRACKING to STANDBY: disarmed"
+
+
+def test_told_to_wait_it_stays_neutral_until_a_station_arms_it():
+    b = Bench(AutopilotConfig(HIRM, wait_arm=True))
+    for k in range(50):
+        b.sample(k)
+    assert {(c["mode"], c["armed"], c["u"][0]) for c in b.commands} == {("STANDBY", False, 0.0)}
+    assert ask(b, ARM_DISARM, 1.0) == [dialect.MAV_RESULT_FAILED]
+    assert b.texts()[-1] == "PreArm: no verified certificate"
+    b.sample(50)
+    assert b.mode == "STANDBY"
+    assert ask(b, ARM_DISARM, 1.0, FORCE) == [dialect.MAV_RESULT_ACCEPTED]
+    for k in range(51, 100):
+        b.sample(k)
+    assert {(c["mode"], c["armed"]) for c in b.commands[51:]} == {("TRACKING", True)}
+    assert beats(b)[-1] == (10, True)
+
+
+def test_a_vehicle_that_is_asked_to_arm_before_its_plant_speaks_says_what_is_missing():
+    b = Bench(AutopilotConfig(load_gains("hirm-d4"), wait_arm=True))
+    b.to(b.now_ns + S)
+    assert ask(b, ARM_DISARM, 1.0) == [dialect.MAV_RESULT_FAILED]
+    assert b.texts()[-1] == "PreArm: no fresh state"
+    for k in range(40, 50):
+        b.sample(k)
+    assert ask(b, ARM_DISARM, 1.0) == [dialect.MAV_RESULT_ACCEPTED]
+    b.sample(50)
+    assert b.mode == "TRACKING"
 
 
 def test_a_stations_frames_do_not_reach_the_elevator():

@@ -11,14 +11,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from autopilot import telemetry as module
+from autopilot.app import AutopilotNode
 from autopilot.clocksync import MIN_EXCHANGES, STALE_NS, ClockSync
+from autopilot.config import AutopilotConfig
 from autopilot.delay import UNKNOWN, DelayEstimate, DelayEstimator, DelayStatus
+from autopilot.ground.vehicle import Vehicle
 from autopilot.link.node import Record
 from autopilot.link.record import decode_line, encode_line, schema_of
 from autopilot.link.wire import Message, NamedValueFloat, NamedValueInt
 from autopilot.telemetry import FORECAST_NS, MAX_ROUND_TRIPS, SECOND_NS, DelayTelemetry, Second, record
-from autopilot.ground.vehicle import Vehicle
-from tests.helpers import MS, TS, S, parse
+from tests.helpers import HIRM, MS, TS, S, parse
 
 quick = settings(deadline=None, max_examples=50)
 START = 1042 * S + 7
@@ -252,27 +254,63 @@ def test_the_table_of_names_is_what_is_sent():
     assert all(len(name) <= 10 for name, _ in sent)
 
 
+def read(vehicle: Vehicle, until_ns: int) -> dict[str, list]:
+    """Tick as with every sample, and return the named values that a station reads, by name."""
+    found: dict[str, list] = {}
+    for now_ns in range(until_ns - FORECAST_NS + TS, until_ns + 1, TS):
+        vehicle.tick(now_ns, degraded=False)
+        for m in (m for _, datagram in vehicle.outgoing() for m in parse(datagram)):
+            if m.get_type() in ("NAMED_VALUE_INT", "NAMED_VALUE_FLOAT"):
+                found.setdefault(m.name, []).append(m)
+    return found
+
+
+def started(now_ns: int) -> Vehicle:
+    """Return the vehicle of an autopilot whose first heartbeat is gone."""
+    vehicle = AutopilotNode(AutopilotConfig(HIRM)).vehicle
+    vehicle.tick(now_ns, degraded=False)
+    vehicle.outgoing()
+    return vehicle
+
+
 def test_a_ground_station_reads_name_value_and_our_time():
-    telemetry, vehicle = everything(), Vehicle(("gcs0",))
-    now_ns = START + SECOND_NS
+    telemetry, now_ns = everything(), START + SECOND_NS
+    vehicle = started(now_ns)
     messages, _ = telemetry.at(now_ns)
     for message in messages:
         vehicle.show(message, now_ns)
-    vehicle.tick(now_ns, tracking=True, degraded=False)
-    read = [m for _, datagram in vehicle.outgoing() for m in parse(datagram)]
-    read = [m for m in read if m.get_type() in ("NAMED_VALUE_INT", "NAMED_VALUE_FLOAT")]
-    assert len(read) == len(messages) == 11
-    for theirs, ours in zip(read, messages, strict=True):
-        assert (theirs.name, theirs.time_boot_ms) == (ours.name, now_ns // MS)
+    found = read(vehicle, now_ns + FORECAST_NS)
+    assert len(found) == len(messages) == 11
+    for ours in messages:
+        [theirs] = found[ours.name]
+        assert isinstance(ours, NamedValueInt) == (theirs.get_type() == "NAMED_VALUE_INT")
+        assert theirs.time_boot_ms == now_ns // MS
         assert theirs.value == pytest.approx(ours.value, rel=1e-6)
 
 
+def test_a_station_misses_none_of_the_numbers_and_gets_none_twice():
+    telemetry, vehicle = everything(), started(START)
+    shown: list[tuple[str, int]] = []
+    got: list[tuple[str, int]] = []
+    for n in range(1, 101):
+        now_ns = START + n * FORECAST_NS
+        telemetry.note_forecast(FORECAST)
+        telemetry.note_report(2)
+        for message in telemetry.at(now_ns)[0]:
+            vehicle.show(message, now_ns)
+            shown.append((message.name, now_ns // MS))
+        got += [(m.name, m.time_boot_ms) for each in read(vehicle, now_ns + FORECAST_NS).values() for m in each]
+    assert len(shown) > 400
+    assert sorted(got) == sorted(shown)
+
+
 def test_the_vehicle_stamps_a_named_float_on_our_clock():
-    vehicle = Vehicle(("gcs0",))
+    vehicle = started(START)
     vehicle.show(NamedValueFloat(7, "D_MEAN", 1.5), START)
-    vehicle.tick(START, tracking=True, degraded=False)
-    [read] = [m for _, d in vehicle.outgoing() for m in parse(d) if m.get_type() == "NAMED_VALUE_FLOAT"]
-    assert (read.time_boot_ms, read.name, read.value) == (START // MS, "D_MEAN", 1.5)
+    found = read(vehicle, START + FORECAST_NS)
+    [m] = found.pop("D_MEAN")
+    assert (m.get_type(), m.time_boot_ms, m.value) == ("NAMED_VALUE_FLOAT", START // MS, 1.5)
+    assert found == {}
 
 
 # Records

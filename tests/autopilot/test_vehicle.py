@@ -62,7 +62,7 @@ NOW = 37_500_000_000_000
 """A time of signatures, in 2026."""
 HELLO = Heartbeat(dialect.MAV_TYPE_GCS, dialect.MAV_AUTOPILOT_INVALID, 0, 0, dialect.MAV_STATE_ACTIVE)
 OPEN = {"DELAY_MIN": 1, "DELAY_MAX": 4, "ELEV_LOW_DEG": -25, "ELEV_HIGH_DEG": 25}
-SET_MESSAGE_INTERVAL, GET_MESSAGE_INTERVAL, REQUEST_MESSAGE = 511, 510, 512
+SET_MESSAGE_INTERVAL, GET_MESSAGE_INTERVAL, REQUEST_MESSAGE, PREFLIGHT_STORAGE = 511, 510, 512, 245
 DEFAULT_HZ = {
     "HEARTBEAT": 1.0,
     "SYS_STATUS": 1.0,
@@ -78,8 +78,11 @@ DEFAULT_HZ = {
 }
 
 
+@dataclass
 class NoDisk:
-    """Parameters that are kept nowhere."""
+    """Parameters that are kept nowhere, and have defaults all the same."""
+
+    parameters: Parameters
 
     def save(self) -> str | None:
         return "nowhere"
@@ -88,7 +91,8 @@ class NoDisk:
         return "nowhere"
 
     def defaults(self, now_ns: int) -> str | None:
-        return "nowhere"
+        self.parameters.announce(self.parameters.reset(now_ns))
+        return None
 
 
 def level(now_ns: int) -> AttitudeTarget:
@@ -116,7 +120,7 @@ class Scene:
             self.banner,
             self.commander,
             self.parameters,
-            NoDisk(),
+            NoDisk(self.parameters),
             ZURICH,
             {AttitudeTarget: level},
             self.seals,
@@ -144,13 +148,19 @@ class Scene:
         return self
 
     def fly(self, duration_ns: int, show: Callable[[int], Iterable[Message]] = lambda _k: ()) -> Scene:
-        """Show what a sample says every 25 ms, sample 0 now, and tick whenever something is due."""
+        """Show what a sample says every 25 ms, the first one in 25 ms, and tick then and whenever something is due."""
         start_ns = self.now_ns
-        for k in range(duration_ns // TS):
-            self.to(start_ns + k * TS)
-            for message in show(k):
-                self.vehicle.show(message, self.now_ns)
-        return self.to(start_ns + duration_ns)
+        for k in range(1, duration_ns // TS + 1):
+            self.show(start_ns + k * TS, *show(k))
+        return self
+
+    def show(self, now_ns: int, *messages: Message) -> None:
+        """Show messages at a time, and tick at once."""
+        self.to(now_ns - 1)  # deliveries come before ticks
+        self.now_ns = now_ns
+        for message in messages:
+            self.vehicle.show(message, now_ns)
+        self.tick()
 
     def hear(self, *messages: Message, port: str = "gcs0") -> bool:
         """Let a station's messages arrive, one datagram each; return whether the last was a station's."""
@@ -334,9 +344,9 @@ def test_what_is_shown_goes_out_when_due_with_the_time_it_was_shown_on_the_autop
         NamedValueFloat(8, "D_MEAN", 2.25),
     ):
         scene.vehicle.show(message, scene.now_ns)
-    scene.to(START + 50 * MS - 1)
-    assert scene.got == []
-    scene.to(START + 200 * MS)
+    for ms in range(3, 201):
+        scene.now_ns = START + ms * MS
+        scene.tick()
     [shown], [air], [servo], [hud] = map(scene.of, ("ATTITUDE", "AOA_SSA", "SERVO_OUTPUT_RAW", "VFR_HUD"))
     [delay], [mean] = map(scene.of, ("NAMED_VALUE_INT", "NAMED_VALUE_FLOAT"))
     assert scene.times("ATTITUDE") == [START + 50 * MS]
@@ -356,21 +366,46 @@ def test_what_is_shown_goes_out_when_due_with_the_time_it_was_shown_on_the_autop
 def test_each_time_the_newest_value_is_shown():
     scene = started()
     scene.fly(2 * S, everything)
-    assert [m.pitch * 1024 for m in scene.of("ATTITUDE")] == [2 * n - 1 for n in range(1, 41)]
-    assert [m.value for m in scene.of("NAMED_VALUE_INT")] == [4 * n - 1 for n in range(1, 21)]
-    shown_ns = [START + (2 * n - 1) * TS for n in range(1, 41)]
-    assert [m.time_boot_ms for m in scene.of("ATTITUDE")] == [t_ns // MS for t_ns in shown_ns]
+    assert [m.pitch * 1024 for m in scene.of("ATTITUDE")] == [2 * n for n in range(1, 41)]
+    assert [m.value for m in scene.of("NAMED_VALUE_INT")] == [4 * n for n in range(1, 21)]
+    assert scene.times("ATTITUDE") == [START + 2 * n * TS for n in range(1, 41)]
+    assert [m.time_boot_ms for m in scene.of("ATTITUDE")] == [(START + 2 * n * TS) // MS for n in range(1, 41)]
+
+
+def test_news_that_comes_when_a_message_is_overdue_is_shown_at_once_and_the_next_is_on_the_grid_again():
+    scene = started()
+    for ms in (63, 99, 100, 170, 199, 200):
+        scene.show(START + ms * MS, attitude(ms / 1024))
+    assert [t_ns - START for t_ns in scene.times("ATTITUDE")] == [63 * MS, 100 * MS, 170 * MS, 200 * MS]
+    assert [m.pitch * 1024 for m in scene.of("ATTITUDE")] == [63, 100, 170, 200]
+
+
+def test_what_a_source_that_stood_still_has_left_out_is_not_made_up_for():
+    scene = started()
+    scene.fly(S, everything)
+    scene.fly(10 * S)
+    scene.got.clear()
+    scene.fly(S, everything)
+    assert [len(scene.of(kind)) for kind in ("ATTITUDE", "AOA_SSA", "VFR_HUD")] == [1 + 20, 1 + 10, 1 + 5]
+    assert scene.times("ATTITUDE")[:3] == [START + 11 * S + ms * MS for ms in (25, 50, 100)]
+
+
+def test_no_stream_of_what_is_shown_wakes_the_vehicle():
+    scene = started()
+    for kind in ("SYS_STATUS", "GLOBAL_POSITION_INT", "ATTITUDE_TARGET", "CURRENT_MODE"):
+        scene.ask(SET_MESSAGE_INTERVAL, next(n for n in STREAMED if dialect.mavlink_map[n].msgname == kind), -1.0)
+    for message in everything(1):
+        scene.vehicle.show(message, START)
+    assert scene.vehicle.next_deadline_ns() == START + S
 
 
 def test_nothing_is_shown_twice():
     scene = started()
-    for message in everything(1):
-        scene.vehicle.show(message, START)
-    scene.to(START + 10 * S)
+    scene.fly(10 * S, lambda k: everything(1) if k == 1 else [])
     measured = ("ATTITUDE", "AOA_SSA", "VFR_HUD", "SERVO_OUTPUT_RAW", "NAMED_VALUE_INT", "NAMED_VALUE_FLOAT")
     assert [len(scene.of(kind)) for kind in measured] == [1] * 6
-    scene.vehicle.show(attitude(2.0), scene.now_ns)
-    assert [m.pitch for m in scene.to(scene.now_ns + S).of("ATTITUDE")] == [1 / 1024, 2.0]
+    scene.fly(S, lambda k: [attitude(2.0)] if k == 1 else [])
+    assert [m.pitch for m in scene.of("ATTITUDE")] == [1 / 1024, 2.0]
 
 
 def test_an_equal_value_that_is_new_is_shown_again():
@@ -382,12 +417,12 @@ def test_an_equal_value_that_is_new_is_shown_again():
 def test_values_with_different_names_are_shown_side_by_side():
     scene = started()
     names = ["DELAY_K", "D_EST", "D_LOW"]
-    scene.fly(S, lambda k: [NamedValueInt(0, names[k % 3], k)])
+    scene.fly(S + 3 * TS, lambda k: [NamedValueInt(0, names[k % 3], k)] if k <= 40 else [])
     newest: dict[str, int] = {}
     for m in scene.of("NAMED_VALUE_INT"):
         assert m.value > newest.get(m.name, -1)
         newest[m.name] = m.value
-    assert newest == {"DELAY_K": 39, "D_EST": 37, "D_LOW": 38}
+    assert newest == {"DELAY_K": 39, "D_EST": 40, "D_LOW": 38}
 
 
 def test_times_wrap_for_a_station_too():
@@ -397,7 +432,7 @@ def test_times_wrap_for_a_station_too():
     scene.vehicle.show(VfrHud(100.0, 100.0, 90, 0, 1600.0, 0.0), scene.now_ns)
     shown_ns = scene.now_ns
     scene.tick()
-    scene.to(scene.now_ns + S)
+    scene.fly(S)
     assert scene.of("ATTITUDE")[0].time_boot_ms == 9
     assert scene.of("SERVO_OUTPUT_RAW")[0].time_usec == (shown_ns // 1000) % (1 << 32)
     assert scene.of("GLOBAL_POSITION_INT")[0].time_boot_ms < 2000
@@ -500,26 +535,38 @@ def test_what_is_not_known_yet_is_not_made_up_when_it_is_asked_for():
     assert scene.to(START + S).of("GLOBAL_POSITION_INT") == []
 
 
-@pytest.mark.parametrize(("hz", "late_ms"), [(3.0, 0), (3.0, 30), (0.7, 300)])
-def test_rates_do_not_drift_in_two_hours_however_late_the_ticks_come(hz, late_ms):
-    scene = started()
+def sent_in_two_hours(scene: Scene, gap_ms: int) -> dict[int, list[int]]:
+    """Tick at random times, none further apart than ``gap_ms``, with news each time; return when each id was sent."""
     rng = np.random.default_rng(1)
-    scene.hear(RequestDataStream(1, 1, dialect.MAV_DATA_STREAM_ALL, 0, 0))
-    scene.ask(SET_MESSAGE_INTERVAL, 436, -1.0)
-    interval_us = round(1e6 / hz)
-    scene.ask(SET_MESSAGE_INTERVAL, 30, interval_us)
-    vehicle, sent = scene.vehicle, {0: [], 30: []}
-    end_ns = START + 7200 * S
-    while (due_ns := vehicle.next_deadline_ns()) <= end_ns:
-        now_ns = due_ns + int(rng.integers(late_ms + 1)) * MS
+    vehicle, sent = scene.vehicle, {}
+    gaps_ms = rng.integers(1, gap_ms + 1, 2 * 7200 * 1000 // gap_ms + 1000)
+    for now_ns in (START + np.cumsum(gaps_ms) * MS).tolist():
+        if now_ns > START + 7200 * S:
+            break
         vehicle.show(attitude(0.0), now_ns)
         vehicle.tick(now_ns, degraded=False)
         for _, datagram in vehicle.outgoing():
-            sent[int.from_bytes(datagram[7:10], "little")].append(now_ns)
-    for number, grid_ns, first_ns in ((0, S, START), (30, interval_us * 1000, 0)):
-        steps = [(t_ns - first_ns) // grid_ns for t_ns in sent[number]]
-        assert steps == list(range(START // grid_ns + 1 if number else 1, (end_ns - first_ns) // grid_ns + 1))
-        assert all(t_ns - first_ns - n * grid_ns <= late_ms * MS for t_ns, n in zip(sent[number], steps, strict=True))
+            sent.setdefault(int.from_bytes(datagram[7:10], "little"), []).append(now_ns)
+    assert now_ns > START + 7200 * S
+    return sent
+
+
+@pytest.mark.parametrize(("hz", "gap_ms"), [(3.0, 200), (0.7, 250), (0.7, 700)])
+def test_rates_do_not_drift_in_two_hours_however_late_the_ticks_come(hz, gap_ms):
+    scene = started()
+    scene.hear(RequestDataStream(1, 1, dialect.MAV_DATA_STREAM_ALL, 0, 0))
+    interval_us = round(1e6 / hz)
+    for number, interval in ((30, interval_us), (1, interval_us), (436, -1)):
+        scene.ask(SET_MESSAGE_INTERVAL, number, interval)
+    scene.to(START)
+    sent = sent_in_two_hours(scene, gap_ms)
+    assert sent.keys() == {0, 1, 30}
+    for number, times_ns in sent.items():
+        grid_ns = S if number == 0 else interval_us * 1000
+        steps = [t_ns // grid_ns for t_ns in times_ns]  # START is on the heartbeat's grid
+        assert steps == list(range(START // grid_ns + 1, steps[-1] + 1))
+        assert times_ns[-1] >= START + 7200 * S - grid_ns - gap_ms * MS
+        assert all(t_ns - n * grid_ns < gap_ms * MS for t_ns, n in zip(times_ns, steps, strict=True))
 
 
 # what waits
@@ -554,8 +601,8 @@ def test_what_waits_for_a_station_is_bounded_and_counted_and_no_other_station_wa
 def test_streams_and_heartbeat_do_not_wait_for_answers():
     scene = started()
     scene.hear(*(Ping(n, n, 0, 0) for n in range(MAX_WAITING)))
-    scene.vehicle.show(attitude(0.5), START)
     scene.now_ns = START + S
+    scene.vehicle.show(attitude(0.5), START + S)
     scene.tick()
     kinds = [m.get_type() for _, _, m in scene.got]
     assert "PING" not in kinds[:-MAX_PER_TICK]
@@ -568,7 +615,7 @@ def test_what_is_shown_takes_no_room_however_much_it_is():
         scene.vehicle.show(NamedValueInt(0, "DELAY_K", n), START)
     assert scene.vehicle.next_deadline_ns() > START
     scene.vehicle.say(Severity.WARNING, "TRACKING to HOLD")
-    scene.to(START + S)
+    scene.fly(S)
     assert scene.texts() == ["TRACKING to HOLD"]
     assert [m.value for m in scene.of("NAMED_VALUE_INT")] == [10 * MAX_WAITING - 1]
     assert scene.vehicle.refused == 0
@@ -693,6 +740,26 @@ def test_a_new_value_is_told_to_all_stations_and_a_refusal_to_the_asker_with_a_t
     assert (error.param_id, error.error) == ("FS_HOLD_S", dialect.MAV_PARAM_ERROR_VALUE_OUT_OF_RANGE)
     assert scene.of("PARAM_ERROR", "gcs1") == []
     assert scene.texts() == scene.texts("gcs1") == ["FS_HOLD_S 61: expected 0 to 60"]
+
+
+def test_values_that_went_back_to_their_defaults_are_told_to_all_stations():
+    scene = started("gcs0", "gcs1")
+    scene.hear(ParamSet(1, 1, "FS_HOLD_S", 2.0, 9), ParamSet(1, 1, "STICK_DEG", 5.0, 9))
+    scene.to(START)
+    scene.got.clear()
+    scene.ask(PREFLIGHT_STORAGE, 2.0)
+    scene.to(START + S)
+    assert [m.result for m in scene.of("COMMAND_ACK")] == [dialect.MAV_RESULT_ACCEPTED]
+    for port in scene.ports:
+        told = [(m.param_id, m.param_value) for m in scene.of("PARAM_VALUE", port)]
+        assert told == [("FS_HOLD_S", 0.5), ("STICK_DEG", 15.0)]
+
+
+def test_parameters_that_cannot_be_kept_are_refused_with_the_reason():
+    scene = started("gcs0", "gcs1")
+    scene.ask(PREFLIGHT_STORAGE, 1.0)
+    assert [m.result for m in scene.of("COMMAND_ACK")] == [dialect.MAV_RESULT_FAILED]
+    assert scene.to(START).texts() == scene.texts("gcs1") == ["nowhere"]
 
 
 # what a station's map and instruments need

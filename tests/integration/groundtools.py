@@ -110,17 +110,26 @@ def near(seen: float, flown: Iterable[float]) -> bool:
 
 
 @contextmanager
-def vehicle(folder: Path, station: int, gains: str = "hirm-d6") -> Iterator[Vehicle]:
+def vehicle(folder: Path, station: int, gains: str = "hirm-d6", passphrase: str | None = None) -> Iterator[Vehicle]:
     """Start a vehicle that waits to be armed, its telemetry to a port of the loopback; killed if it is not landed.
 
-    What its programs have said is shown when the station fails.
+    With a passphrase both its links are signed. What its programs have said is shown when the station fails.
     """
     port = free_port()
+    plant_key: list[str] = []
+    keys: list[str] = []
+    if passphrase is not None:
+        file = folder / "link.key"
+        file.touch(mode=0o600)
+        file.write_text(passphrase + "\n")
+        plant_key, keys = ["--key", str(file)], ["--key", f"plant={file}", "--key", f"gcs={file}"]
     line = ["--plant", f"udpout:127.0.0.1:{port}", "--gcs", f"udpout:127.0.0.1:{station}"]
     flight = ["--gains", gains, "--reference", "5deg@1s", "--wait-arm"]
     with (
-        program(folder, "sitl", "plant", "--listen", f"127.0.0.1:{port}", "--record", "plant.mcap") as plant,
-        program(folder, "autopilot", *line, *flight) as autopilot,
+        program(
+            folder, "sitl", "plant", "--listen", f"127.0.0.1:{port}", "--record", "plant.mcap", *plant_key
+        ) as plant,
+        program(folder, "autopilot", *line, *flight, *keys) as autopilot,
     ):
         try:
             yield Vehicle(folder, plant, autopilot)

@@ -12,6 +12,8 @@ from tests.integration.groundtools import PREARM_CHECK, STEP_RAD, MavProxy, mavp
 from tests.integration.programs import eventually, free_port
 
 PARAMETER, VALUE, OUT_OF_RANGE = "STICK_DEG", 7.5, -1.0
+PASSPHRASE = "a good passphrase"
+"""Both links of the vehicle are signed; the other tools' are not."""
 UNPROVED = "hirm-paper"
 """Gains without a certificate, which the ground cannot arm until a parameter says otherwise."""
 
@@ -50,7 +52,8 @@ def session(tmp_path_factory: pytest.TempPathFactory) -> Session:
     folder, port = tmp_path_factory.mktemp("mavproxy"), free_port()
     with mavproxy(folder, port, modules=None) as station:
         eventually("MAVProxy's prompt", lambda: "MAV>" in station.transcript)
-        with vehicle(folder, port, gains=UNPROVED) as flying:
+        station.ask(f'signing key "{PASSPHRASE}"', "Setup signing key")
+        with vehicle(folder, port, gains=UNPROVED, passphrase=PASSPHRASE) as flying:
             eventually("the parameters", lambda: "Received" in station.transcript)
             station.ask("arm throttle", "COMPONENT_ARM_DISARM: FAILED")
             station.say("param set ARM_CERT 0")

@@ -225,7 +225,7 @@ def test_a_ground_station_that_is_not_there_is_no_error(unwatched: Flight) -> No
     assert unwatched.code == 0, unwatched.stderr
     assert unwatched.summary["failsafe_events"] == 0
     sent = Counter(message.get_type() for message in unwatched.frames("gcs0"))
-    assert sent["ATTITUDE"] > 150
+    assert sent["ATTITUDE"] > 70  # four seconds at 20 Hz
 
 
 def test_the_true_delay_is_the_age_of_a_command_that_was_sent(each: Flight) -> None:
@@ -255,8 +255,8 @@ def test_mavlogdump_reads_in_the_tlog_every_frame_of_the_recording(watched: Flig
     dump = subprocess.run(command, capture_output=True, text=True, check=True, timeout=60)
     types = Counter(json.loads(line)["meta"]["type"] for line in dump.stdout.splitlines())
     assert types == Counter(m.get_type() for m in watched.frames("gcs0"))
-    for name in ("ATTITUDE", "AOA_SSA", "SERVO_OUTPUT_RAW"):
-        assert types[name] > 350
+    for name, rate_hz in (("ATTITUDE", 20), ("AOA_SSA", 10), ("SERVO_OUTPUT_RAW", 10)):
+        assert types[name] > 0.9 * rate_hz * 10.0, name
     assert "BAD_DATA" not in types
 
 
