@@ -14,6 +14,7 @@ from autopilot.config import AutopilotConfig
 from autopilot.link.clock import Clock
 from autopilot.link.node import Record
 from autopilot.link.virtual import Participant, VirtualNetwork
+from autopilot.link.wire import autopilot_heartbeat
 from gains.store import load_gains
 from sitl.plant import PlantConfig, PlantNode
 
@@ -24,6 +25,8 @@ HIRM = load_gains("hirm-paper")
 PLANT_CLOCK = Clock(137 * S, 40_000)
 AUTOPILOT_CLOCK = Clock(1042 * S, -60_000)
 LINE_CLOCK = Clock(11 * S, -20_000)
+HEARTBEAT = autopilot_heartbeat(armed=True, custom_mode=10, flags=28, degraded=False)
+"""Of an autopilot in AUTO."""
 
 
 def parse(datagram: bytes) -> list:

@@ -29,13 +29,12 @@ from autopilot.link.wire import (
     NamedValueInt,
     VfrHud,
     Wire,
-    autopilot_heartbeat,
 )
 from autopilot.state import Drop, Sample, SampleAssembler
 from gains.store import load_model
 from gains.table import InputError
 from sitl.plant import PlantConfig, PlantNode
-from tests.helpers import HIRM, MS, TS, S
+from tests.helpers import HEARTBEAT, HIRM, MS, TS, S
 
 MODEL = HIRM.model
 SPEED = 100.0
@@ -359,7 +358,7 @@ def test_whatever_vfr_hud_says_gamma_is_an_angle_or_none(airspeed: float, climb:
 def flown(aoa: bool) -> tuple[Bench, np.ndarray]:
     """Fly the linear aircraft with a wild elevator into an assembler; return it and the true states."""
     plant, wire = PlantNode(PlantConfig(MODEL, np.array([0.05, 0.0, 0.1]), aoa=aoa)), Wire(AUTOPILOT, None)
-    plant.receive("autopilot", wire.encode(autopilot_heartbeat(armed=True, custom_mode=10, flags=28, degraded=False)), T0)
+    plant.receive("autopilot", wire.encode(HEARTBEAT), T0)
     rng, b, truth = np.random.default_rng(3), Bench("auto"), []
     for k in range(400):
         b.now_ns = T0 + k * TS

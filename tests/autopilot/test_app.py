@@ -551,9 +551,9 @@ def test_a_station_sees_what_the_plant_says_as_the_autopilot_on_its_clock():
     pulses = [m.servo2_raw for _, m in flight.sent("autopilot", "plant") if m.get_type() == "SERVO_OUTPUT_RAW"]
     by_ms = {at_ns // MS: (body, pulse) for (at_ns, body), pulse in zip(commands, pulses, strict=True)}
     for kind, hz in (("ATTITUDE", 20), ("AOA_SSA", 10), ("SERVO_OUTPUT_RAW", 10)):
-        slots = [now_ns * hz // S for now_ns, _ in seen[kind]]
+        slots = [now_ns * hz // S for now_ns, _ in seen[kind] if now_ns > commands[0][0] + S]
         assert slots == list(range(slots[0], slots[0] + len(slots))), kind
-        assert len(slots) >= (commands[-1][0] - commands[0][0]) * hz // S
+        assert len(slots) >= (commands[-1][0] - commands[0][0] - S) * hz // S
         for now_ns, m in seen[kind]:
             stamp_ms = m.time_boot_ms if kind == "ATTITUDE" else (m.time_usec // 1000)
             newest_ms = max(ms for ms in by_ms if ms <= now_ns // MS)
@@ -580,8 +580,8 @@ def test_a_station_is_not_shown_an_old_attitude_as_a_new_one():
     for kind, stamp, unit_ns in (("ATTITUDE", "time_boot_ms", MS), ("AOA_SSA", "time_usec", 1000)):
         stamps = [getattr(m, stamp) * unit_ns for _, m in seen[kind]]
         assert stamps == sorted(set(stamps))
-        assert last_ns - 4 * TS < stamps[-1] <= last_ns
-        assert all(0 <= now_ns - stamp_ns < TS for (now_ns, _), stamp_ns in zip(seen[kind], stamps, strict=True))
+        assert stamps[-1] == last_ns // unit_ns * unit_ns
+        assert max(now_ns for now_ns, _ in seen[kind]) < last_ns + 150 * MS  # its interval, and the next tick
 
 
 def test_the_reference_that_is_flown_is_shown_and_no_attitude_while_no_law_flies():

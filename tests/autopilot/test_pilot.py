@@ -11,13 +11,13 @@ import pytest
 
 from autopilot.config import AutopilotConfig
 from autopilot.failsafe import CALM_SAMPLES, REST_NS
-from autopilot.link.wire import AoaSsa, Attitude, NamedValueInt, Wire, autopilot_heartbeat
+from autopilot.link.wire import AoaSsa, Attitude, NamedValueInt, Wire
 from autopilot.pilot import MAX_AHEAD
 from autopilot.profile import parse_profile
 from gains.model import Gains
 from gains.store import load_gains
 from tests.autopilot.bench import TREMBLE, Bench
-from tests.helpers import HIRM, MS, TS, S
+from tests.helpers import HEARTBEAT, HIRM, MS, TS, S
 
 D3, D6 = load_gains("hirm-d3"), load_gains("hirm-d6")
 """Delays 1 to 3, and 1 to 6: the conservative gains of the first."""
@@ -345,7 +345,7 @@ def test_the_reference_is_looked_ahead_200_samples_beyond_the_window_at_the_most
 def with_station(b: Bench, count: int, age_ns: int = NEAR) -> None:
     """Let samples come while the ground station sends its heartbeats."""
     for _ in range(count):
-        b.node.receive("gcs0", STATION.encode(autopilot_heartbeat(armed=True, custom_mode=10, flags=28, degraded=False)), b.now_ns)
+        b.node.receive("gcs0", STATION.encode(HEARTBEAT), b.now_ns)
         give(b, 1, age_ns)
 
 
@@ -379,7 +379,7 @@ def test_a_lost_ground_station_eases_the_reference_to_zero_and_it_comes_back_wit
 def test_the_loss_of_a_ground_station_is_told_at_its_very_instant():
     b = bench(D3, ground_timeout_ns=2 * S)
     with_station(b, 50)
-    b.node.receive("gcs0", STATION.encode(autopilot_heartbeat(armed=True, custom_mode=10, flags=28, degraded=False)), b.now_ns)
+    b.node.receive("gcs0", STATION.encode(HEARTBEAT), b.now_ns)
     heard_ns = b.now_ns
     give(b, 100, 33 * MS)
     assert (b.mode, b.node.failsafe.since_ns) == ("LEVEL", heard_ns + 2 * S)

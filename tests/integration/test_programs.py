@@ -24,9 +24,9 @@ from autopilot.link.wire import (
     NamedValueInt,
     Timesync,
     Wire,
-    autopilot_heartbeat,
 )
 from sitl.processes import MAX_UNKNOWN, Supervisor
+from tests.helpers import HEARTBEAT
 from tests.integration.programs import (
     Program,
     a_socket,
@@ -159,12 +159,12 @@ def test_a_plant_with_a_fixed_peer_flies_with_that_peer_and_hears_no_stranger(tm
         plant = stack.enter_context(program(tmp_path, *line))
         eventually("plant", lambda: listens(port))
         wire, forger = Wire(AUTOPILOT, PLANT), Wire(AUTOPILOT, PLANT)
-        forged = [autopilot_heartbeat(armed=True, custom_mode=10, flags=28, degraded=False), Timesync(0, 666)]
+        forged = [HEARTBEAT, Timesync(0, 666)]
         for message in forged * 50:
             stranger.sendto(forger.encode(message), address)
         peer.sendto(wire.encode(Timesync(0, 7)), address)
         assert receive(peer, wire, Timesync).ts1 == 7  # and so all before it has been read
-        peer.sendto(wire.encode(autopilot_heartbeat(armed=True, custom_mode=10, flags=28, degraded=False)), address)
+        peer.sendto(wire.encode(HEARTBEAT), address)
         assert receive(peer, wire, NamedValueInt).name == "SAMPLE_K"
         for k in range(1, 40):
             t_us = receive(peer, wire, Attitude).time_boot_ms * 1000
@@ -187,7 +187,7 @@ def test_a_relay_with_a_fixed_peer_passes_on_nothing_of_a_stranger_in_either_dir
         line = ["sitl", "relay", "--listen", f"127.0.0.1:{port}", "--to", far, "--peer", client]
         with program(tmp_path, *line) as relay:
             eventually("relay", lambda: listens(port))
-            forged = Wire(AUTOPILOT, PLANT).encode(autopilot_heartbeat(armed=True, custom_mode=10, flags=28, degraded=False))
+            forged = Wire(AUTOPILOT, PLANT).encode(HEARTBEAT)
             for _ in range(50):
                 stranger.sendto(forged, ("127.0.0.1", port))
             peer.sendto(b"down", ("127.0.0.1", port))

@@ -22,7 +22,6 @@ from autopilot.link.wire import (
     ServoOutputRaw,
     Timesync,
     Wire,
-    autopilot_heartbeat,
     plant_heartbeat,
 )
 from gains.table import InputError
@@ -31,7 +30,7 @@ from sitl.flight import fly_virtual
 from sitl.gate import MAX_HISTORY, Gate, Miss, check_flyable
 from sitl.linkspec import parse_spec
 from sitl.scenario import Scenario, load_scenario
-from tests.helpers import HIRM, MS, TS, S, broken
+from tests.helpers import HEARTBEAT, HIRM, MS, TS, S, broken
 
 T0 = 137 * S
 HIRM_WITNESS = load_scenario("witness")
@@ -275,9 +274,7 @@ def test_a_datagram_with_commands_of_several_samples_is_swallowed() -> None:
     assert b.gate.command(frames[0] * 2, "same") == ((("same", 0),), ())
 
 
-@pytest.mark.parametrize(
-    "message", [Timesync(0, 5), Timesync(5, 6), autopilot_heartbeat(armed=True, custom_mode=10, flags=28, degraded=False)]
-)
+@pytest.mark.parametrize("message", [Timesync(0, 5), Timesync(5, 6), HEARTBEAT])
 def test_everything_but_commands_is_none_of_its_business(message: Message) -> None:
     b = bench(1)
     assert b.gate.command(b.autopilot.encode(message), "x") is None

@@ -21,18 +21,16 @@ from autopilot.link.wire import (
     ServoOutputRaw,
     Timesync,
     Wire,
-    autopilot_heartbeat,
 )
 from gains.model import Actuator, Trim
 from gains.store import load_model
 from sitl.aircraft.disturbance import HarmonicGust, SquareDelta
 from sitl.plant import DIVERGED, MAX_CATCH_UP, MAX_COMMANDS, PlantConfig, PlantNode, Refusal
-from tests.helpers import HIRM, MS, TS, S, broken, parse
+from tests.helpers import HEARTBEAT, HIRM, MS, TS, S, broken, parse
 
 quick = settings(deadline=None)
 MODEL = HIRM.model
 T0 = 137 * S
-HEARTBEAT = autopilot_heartbeat(armed=True, custom_mode=10, flags=28, degraded=False)
 
 
 @dataclass

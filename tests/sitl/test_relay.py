@@ -19,7 +19,6 @@ from autopilot.link.wire import (
     ServoOutputRaw,
     Timesync,
     Wire,
-    autopilot_heartbeat,
 )
 from gains.witnessfile import Witness
 from sitl import relay as relay_module
@@ -27,6 +26,7 @@ from sitl.gate import Gate
 from sitl.impairment import LinkSpec
 from sitl.linkspec import parse_spec
 from sitl.relay import MAX_QUEUED, Counters, RelayNode
+from tests.helpers import HEARTBEAT
 
 MS = 1_000_000
 S = 1_000_000_000
@@ -190,7 +190,7 @@ def test_with_a_gate_too_every_copy_is_accounted_for(up, down, delays, gaps):
 def test_the_gate_leaves_other_packets_and_their_delay_alone():
     plain, gated = (Flight("delay=3ms", "delay=7ms", gate=gate) for gate in (None, Gate(WITNESS)))
     wire = Wire(AUTOPILOT, PLANT)
-    frames = [wire.encode(message) for message in (Timesync(0, 5), autopilot_heartbeat(armed=True, custom_mode=10, flags=28, degraded=False))]
+    frames = [wire.encode(message) for message in (Timesync(0, 5), HEARTBEAT)]
     for flight in (plain, gated):
         for n, payload in enumerate([*frames, b"noise", b""]):
             flight.send("autopilot", payload, n * MS)
