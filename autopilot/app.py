@@ -25,6 +25,7 @@ from autopilot.link.sensors import pitch_index
 from autopilot.link.wire import (
     AUTOPILOT,
     PLANT,
+    U32,
     AoaSsa,
     Attitude,
     HilActuatorControls,
@@ -417,12 +418,12 @@ class AutopilotNode:
         """Return ATTITUDE_TARGET: the pitch reference that is flown now; no attitude while no law flies."""
         command, mask = self._told, RATES_AND_THRUST_IGNORE
         pitch = self._trim_pitch
-        if command is not None and command.mode in FLOWN_BY_LAW and self._pitch_index is not None:
+        if command is not None and self.pilot.mode in FLOWN_BY_LAW and self._pitch_index is not None:
             pitch += command.r
         else:
             mask |= ATTITUDE_IGNORE
         q = (math.cos(pitch / 2), 0.0, math.sin(pitch / 2), 0.0)
-        return AttitudeTarget(now_ns // NS_PER_MS, mask, q, 0.0, 0.0, 0.0, 0.0)
+        return AttitudeTarget(now_ns // NS_PER_MS & U32, mask, q, 0.0, 0.0, 0.0, 0.0)
 
     def _notice(self, notice: Notice) -> None:
         """Tell of a change of mode."""

@@ -134,8 +134,8 @@ class Parameters:
     # -- the protocol
 
     def request_list(self, port: str) -> None:
-        """Answer a PARAM_REQUEST_LIST: the whole list waits for this station, from its beginning."""
-        self._waiting[port] = dict.fromkeys(self.table)
+        """Answer a PARAM_REQUEST_LIST: the whole list waits for this station, behind what waits already."""
+        self._waiting[port].update(dict.fromkeys(self.table))
 
     def announce(self, names: Iterable[str]) -> None:
         """Let the values of these names wait for every station."""

@@ -54,9 +54,11 @@ class Position:
         self._air, self._air_ns = air, now_ns
 
     def message(self, now_ns: int) -> GlobalPositionInt | None:
-        """Return GLOBAL_POSITION_INT; None before the first VFR_HUD, or for numbers that do not fit into it."""
+        """Return GLOBAL_POSITION_INT; None without a fresh VFR_HUD, or for numbers that do not fit into it."""
         air = self._air
-        if air is None or not (abs(air.alt) < 2e6 and abs(air.groundspeed) < 327.0 and abs(air.climb) < 327.0):
+        if air is None or now_ns - self._air_ns > MAX_GAP_NS:
+            return None
+        if not (abs(air.alt) < 2e6 and abs(air.groundspeed) < 327.0 and abs(air.climb) < 327.0):
             return None
         heading = math.radians(air.heading)
         return GlobalPositionInt(

@@ -1,8 +1,8 @@
 """How often each message goes to one ground station, as that station has asked.
 
 A message is due at the multiples of its interval of our own clock, so its rate never drifts and messages of equal rate
-leave together. One that is due leaves when there is news of it; what came late by less than an interval does not delay
-the next, so a stream as fast as its source loses nothing to jitter, and what came later is not made up for.
+leave together. One that is due leaves when there is news of it; one that came late by less than two intervals does not
+delay the next, so a stream as fast as its source loses nothing to jitter, and what came later is not made up for.
 """
 
 from __future__ import annotations

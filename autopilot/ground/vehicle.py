@@ -64,6 +64,8 @@ __all__ = ["Vehicle", "banner"]
 HEARTBEAT_NS = NS_PER_S
 MAX_WAITING = 256
 """Messages that may wait for one station; further ones are refused and counted."""
+MAX_TEXTS = 32
+"""Texts that may wait when nothing else may."""
 MAX_PER_TICK = 16
 """Waiting messages that one tick sends to one station."""
 PARAMETERS_NS = 10 * NS_PER_MS
@@ -90,7 +92,7 @@ class _Station:
     wire: Wire
     streams: Streams
     waiting: deque[Message] = field(default_factory=deque)
-    news: set[type] = field(default_factory=set)
+    news: dict[type, None] = field(default_factory=dict)
     seen: defaultdict[type, dict[str, _Shown]] = field(default_factory=lambda: defaultdict(dict))
     heard: bool = False
     next_parameters_ns: int | None = None
@@ -253,11 +255,12 @@ class Vehicle:
         kind = type(message)
         self._shown[kind][name] = message, now_ns
         for station in self._stations.values():
-            station.news.add(kind)
+            station.news[kind] = None
 
     def say(self, severity: int, text: str) -> None:
-        """Send a STATUSTEXT to every ground station."""
-        self._wait_all(StatusText(severity, text))
+        """Send a STATUSTEXT to every ground station; there is room for it when nothing else may wait."""
+        for station in self._stations.values():
+            self._wait(station, StatusText(severity, text), MAX_WAITING + MAX_TEXTS)
 
     def current(self, message: type, now_ns: int) -> Iterable[Message]:
         """Return the messages of a type as they are now: several of a type with names, none of one unknown."""
@@ -276,7 +279,7 @@ class Vehicle:
             self._next_heartbeat_ns = now_ns
             self._start(now_ns)
         if self.parameters.values is not self._values:
-            self._follow_rates(now_ns)
+            self._follow_values(now_ns)
         beat = now_ns >= self._next_heartbeat_ns
         if beat:
             self._next_heartbeat_ns = following(self._next_heartbeat_ns, HEARTBEAT_NS, now_ns)
@@ -288,6 +291,7 @@ class Vehicle:
     def _start(self, now_ns: int) -> None:
         for station in self._stations.values():
             station.streams.start(now_ns)
+            self._send(station, self.position.home_message(now_ns))
             for text in self.banner:
                 self._send(station, text)
 
@@ -330,7 +334,7 @@ class Vehicle:
 
     def _send_news(self, station: _Station, message: type) -> None:
         """Send what a station has not seen of a type: the latest, or the latest of each name."""
-        station.news.discard(message)
+        del station.news[message]
         seen = station.seen[message]
         for name, shown in self._shown[message].items():
             if seen.get(name) is not shown:
@@ -343,12 +347,15 @@ class Vehicle:
         more = self.parameters.pending(station.port)
         station.next_parameters_ns = now_ns + PARAMETERS_NS if more else None
 
-    def _follow_rates(self, now_ns: int) -> None:
-        """Take over default rates that were changed by parameters."""
+    def _follow_values(self, now_ns: int) -> None:
+        """Take over default rates that were changed by parameters, and let stations know what changed unasked."""
         self._values = self.parameters.values
         for name, message in RATE_PARAMETERS.items():
             for station in self._stations.values():
                 station.streams.set_default(message, self._values[name], now_ns)
+        for station in self._stations.values():
+            if station.next_parameters_ns is None and self.parameters.pending(station.port):
+                station.next_parameters_ns = now_ns
 
     def _sys_status(self, now_ns: int) -> SysStatus:
         """Return SYS_STATUS; MAVProxy takes a geofence that is not healthy for a breach, even where there is none."""
@@ -370,8 +377,8 @@ class Vehicle:
         for station in self._stations.values():
             self._wait(station, message)
 
-    def _wait(self, station: _Station, message: Message) -> None:
-        if len(station.waiting) < MAX_WAITING:
+    def _wait(self, station: _Station, message: Message, limit: int = MAX_WAITING) -> None:
+        if len(station.waiting) < limit:
             station.waiting.append(message)
             self._deadline_ns = None
         else:

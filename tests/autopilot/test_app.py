@@ -638,6 +638,15 @@ def test_by_default_the_vehicle_arms_itself_once_with_the_first_good_sample():
     assert b.transitions()[-1] == "TRACKING to STANDBY: disarmed"
 
 
+def test_a_vehicle_that_was_disarmed_before_its_first_sample_does_not_arm_itself():
+    b = Bench()
+    b.to(b.now_ns + 500 * MS)
+    assert ask(b, ARM_DISARM, 0.0) == [dialect.MAV_RESULT_ACCEPTED]
+    for k in range(20):
+        b.sample(k)
+    assert {(c["mode"], c["armed"], c["u"][0]) for c in b.commands} == {("STANDBY", False, 0.0)}
+
+
 def test_told_to_wait_it_stays_neutral_until_a_station_arms_it():
     b = Bench(AutopilotConfig(HIRM, wait_arm=True))
     for k in range(50):

@@ -34,7 +34,7 @@ MODES = {"MANUAL": 0, "STABILIZE": 2, "AUTO": 10, "GUIDED": 15}
 
 @dataclass
 class Cockpit(Bench):
-    """An autopilot on the bench and a ground station per port, (255, 190), (254, 190), ...; its frames are pymavlink's."""
+    """An autopilot on the bench, a station of pymavlink's frames per port: (255, 190), (254, 190), ..."""
 
     config: AutopilotConfig = field(default_factory=lambda: AutopilotConfig(ALONE, wait_arm=True))
 

@@ -207,7 +207,7 @@ def test_a_list_goes_out_in_portions_to_each_station_at_its_own_pace():
     assert [parameters.pending(port) for port in ("gcs0", "gcs1")] == [0, 0]
 
 
-def test_a_repeated_request_begins_that_station_s_list_anew_and_no_other():
+def test_a_repeated_request_gives_that_station_the_whole_list_again_behind_what_waits_and_no_other():
     parameters = make(ports=("gcs0", "gcs1"))
     parameters.request_list("gcs0")
     parameters.request_list("gcs1")
@@ -216,7 +216,8 @@ def test_a_repeated_request_begins_that_station_s_list_anew_and_no_other():
     for _ in range(1000):
         parameters.request_list("gcs0")
     assert parameters.pending("gcs0") == COUNT
-    assert [v.param_index for v in parameters.next_values("gcs0", 2)] == [0, 1]
+    whole = [v.param_index for v in parameters.next_values("gcs0", COUNT)]
+    assert whole == [*range(7, COUNT), *range(7)]
     assert [v.param_index for v in parameters.next_values("gcs1", 2)] == [7, 8]
 
 

@@ -84,6 +84,8 @@ def sample_records(k: int) -> list[Record]:
         "d_probability": 0.97 if known else None,
         "status": "ok" if known else "unknown",
         "mode": "TRACKING",
+        "flight_mode": "AUTO",
+        "armed": True,
         "gain_set": 0,
         "alpha": "aoa_ssa",
     }

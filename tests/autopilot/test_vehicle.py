@@ -51,6 +51,7 @@ from autopilot.link.wire import (
     Timesync,
     VfrHud,
     Wire,
+    message_id,
 )
 from gains.model import Gains, Schedule
 from gains.verify import verified
@@ -301,7 +302,7 @@ def test_the_banner_is_told_before_the_first_heartbeat_and_once_more_to_a_statio
     scene = Scene(("gcs0", "gcs1"), [StatusText(Severity.WARNING, "no certificate")])
     scene.tick()
     for port in scene.ports:
-        assert [m.get_type() for _, where, m in scene.got if where == port] == ["STATUSTEXT", "HEARTBEAT"]
+        assert [m.get_type() for _, where, m in scene.got if where == port] == ["HOME_POSITION", "STATUSTEXT", "HEARTBEAT"]
     assert scene.texts() == ["no certificate"]
     scene.got.clear()
     for _ in range(3):
@@ -406,6 +407,25 @@ def test_nothing_is_shown_twice():
     assert [len(scene.of(kind)) for kind in measured] == [1] * 6
     scene.fly(S, lambda k: [attitude(2.0)] if k == 1 else [])
     assert [m.pitch for m in scene.of("ATTITUDE")] == [1 / 1024, 2.0]
+
+
+def test_news_of_one_name_does_not_show_another_again():
+    scene = started()
+    scene.fly(S, lambda k: [NamedValueInt(0, "DELAY_K", k), *([NamedValueInt(0, "D_EST", 3)] if k == 1 else [])])
+    counts = Counter(m.name for m in scene.of("NAMED_VALUE_INT"))
+    assert counts == {"DELAY_K": 10, "D_EST": 1}
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_what_is_due_at_once_leaves_in_the_order_in_which_it_was_shown(seed):
+    scene = started()
+    shown = [everything(1)[n] for n in np.random.default_rng(seed).permutation(6)]
+    scene.now_ns = START + 999 * MS
+    for message in shown:
+        scene.vehicle.show(message, scene.now_ns)
+    scene.tick()
+    ids = {message_id(type(message)) for message in shown}
+    assert [m.get_msgId() for _, _, m in scene.got if m.get_msgId() in ids] == [message_id(type(m)) for m in shown]
 
 
 def test_an_equal_value_that_is_new_is_shown_again():
@@ -727,7 +747,7 @@ def test_requests_for_the_list_without_end_do_not_make_it_come_faster():
     assert len(scene.of("PARAM_VALUE")) <= 10 * PARAMETERS_PER_TICK
     assert scene.vehicle.refused == 0
     scene.to(scene.now_ns + S)
-    assert [m.param_index for m in scene.of("PARAM_VALUE")][-len(PARAMETERS) :] == list(range(len(PARAMETERS)))
+    assert sorted(m.param_index for m in scene.of("PARAM_VALUE")[-len(PARAMETERS) :]) == list(range(len(PARAMETERS)))
 
 
 def test_a_new_value_is_told_to_all_stations_and_a_refusal_to_the_asker_with_a_text_to_all():

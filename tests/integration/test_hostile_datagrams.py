@@ -298,7 +298,7 @@ def test_the_failsafe_and_the_law_see_nothing_of_it(flown: Flown) -> None:
     assert [(e["data"]["from"], e["data"]["to"]) for e in events if e["kind"] == "failsafe"] == [
         ("STANDBY", "TRACKING")
     ]
-    assert {e["kind"] for e in events} == {"gains", "counters", "failsafe", "ports", "alpha"}
+    assert {e["kind"] for e in events} == {"gains", "counters", "failsafe", "ports", "alpha", "commander"}
     commands = flown.bodies["autopilot/command"]
     assert {body["mode"] for body in commands} == {"TRACKING"}
     truth = {body["k"]: body for body in flown.bodies["plant/truth"]}
