@@ -205,7 +205,8 @@ class AutopilotNode:
     def outgoing(self) -> list[Datagram]:
         """Take away the datagrams to send, the plant's first."""
         out, self._out = self._out, []
-        return out + self.vehicle.outgoing()
+        out += self.vehicle.outgoing()
+        return out
 
     def records(self) -> list[Record]:
         """Take away the records."""

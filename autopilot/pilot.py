@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -45,8 +45,7 @@ _TRIM = Steady()
 _NO_LIMITS = (-sys.float_info.max, sys.float_info.max)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Command:
+class Command(NamedTuple):
     """A command as it is sent.
 
     Attributes

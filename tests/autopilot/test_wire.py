@@ -21,7 +21,7 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 from pymavlink.dialects.v20 import development
 
 from autopilot.link import groundmessages as ground
-from autopilot.link import wire as wire_module
+from autopilot.link.codecs import CODECS
 from autopilot.link.signing import Signing, Verdict
 from autopilot.link.wire import (
     AUTOPILOT,
@@ -208,7 +208,7 @@ def test_a_cut_frame_is_counted_and_does_not_touch_the_next_one(message, data):
 @pytest.mark.parametrize("bad", [NAN, INF, -INF])
 @pytest.mark.parametrize(
     ("message", "name"),
-    [(m, n) for m in EXAMPLES for n in wire_module._CODECS[type(m)].floats],
+    [(m, n) for m in EXAMPLES for n in CODECS[type(m)].floats],
     ids=lambda v: v if isinstance(v, str) else type(v).__name__,
 )
 def test_what_is_not_finite_is_dropped_and_counted(message, name, bad):
@@ -221,7 +221,7 @@ def test_what_is_not_finite_is_dropped_and_counted(message, name, bad):
 def test_every_float_of_every_message_is_checked_for_being_finite():
     for message in EXAMPLES:
         floats = {f.name for f in fields(message) if isinstance(getattr(message, f.name), float)}
-        assert set(wire_module._CODECS[type(message)].floats) == floats
+        assert set(CODECS[type(message)].floats) == floats
 
 
 @pytest.mark.parametrize("source", [(2, 25), (1, 24), (1, 1), (255, 190), (0, 0)])
