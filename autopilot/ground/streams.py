@@ -74,7 +74,7 @@ class Streams:
 
     def __init__(self, rates: Mapping[type, float], timed: Collection[type]) -> None:
         self._defaults = {each: interval_of(rates.get(each, FIXED_RATES.get(each, 0.0))) for each in STREAMED.values()}
-        self._timed = frozenset(timed)
+        self._timed = tuple(timed)  # in order: what is due together leaves so
         self._asked: dict[type, int | None] = {}
         self._due_ns: dict[type, int] = {}
         self._started = False
