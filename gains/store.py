@@ -7,11 +7,9 @@ The quantities of [reference] and [uncertainty] are discrete at Ts, also where t
 
 from __future__ import annotations
 
-import contextlib
 import difflib
 import os
 import re
-import tempfile
 from dataclasses import replace
 from importlib import resources
 from pathlib import Path
@@ -20,6 +18,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 import tomli_w
 
+from gains.atomic import replace_file
 from gains.gainfile import DELAY_LIMIT, check_conservative, content_of, read_gains, read_schedule
 from gains.model import (
     Actuator,
@@ -225,18 +224,7 @@ def save_gains(path: str | Path, gains: GainLaw, model: str | Path) -> None:
         _require_other(str(path), gains.conservative_file)
         conservative = _name_for(gains.conservative_file, path)
     content = content_of(gains, _name_for(resolve(model), path), conservative)
-    handle, temporary = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
-    try:
-        with os.fdopen(handle, "wb") as out:
-            tomli_w.dump(content, out)
-        mask = os.umask(0)
-        os.umask(mask)
-        os.chmod(temporary, 0o666 & ~mask)
-        os.replace(temporary, path)
-    except BaseException:
-        with contextlib.suppress(OSError):
-            os.unlink(temporary)
-        raise
+    replace_file(path, tomli_w.dumps(content).encode())
 
 
 def _parse_alone(table: Table) -> GainLaw:

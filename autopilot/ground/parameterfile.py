@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
-import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 import tomli_w
 
+from gains.atomic import replace_file
 from gains.table import Table
 
 __all__ = ["ParameterFile"]
@@ -53,16 +52,4 @@ class ParameterFile:
         OSError
             When that is not possible; the old file stays.
         """
-        content = (HEADER + tomli_w.dumps(values)).encode()
-        handle, temporary = tempfile.mkstemp(prefix=f".{self.path.name}.", dir=self.path.parent)
-        try:
-            with os.fdopen(handle, "wb") as out:
-                out.write(content)
-            mask = os.umask(0)
-            os.umask(mask)
-            os.chmod(temporary, 0o666 & ~mask)
-            os.replace(temporary, self.path)
-        except BaseException:
-            with contextlib.suppress(OSError):
-                os.unlink(temporary)
-            raise
+        replace_file(self.path, (HEADER + tomli_w.dumps(values)).encode())

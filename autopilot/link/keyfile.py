@@ -14,10 +14,8 @@ On Windows neither owner nor mode is checked: access is not expressed by them th
 
 from __future__ import annotations
 
-import contextlib
 import os
 import stat
-import tempfile
 import unicodedata
 from dataclasses import dataclass
 from hashlib import sha256
@@ -28,6 +26,7 @@ import tomli_w
 
 from autopilot.link.clock import NS_PER_S
 from autopilot.link.signing import LAST_TIMESTAMP, MAX_STREAMS, UNIT_NS, Signing, Stream, Timestamps, timestamp_of
+from gains.atomic import replace_file
 from gains.table import InputError, Table
 
 __all__ = ["TimestampStore", "read_key", "timestamps_path", "wall_clock_start"]
@@ -278,7 +277,7 @@ class TimestampStore:
         entries = {**self._entries, **timestamps}
         content = tomli_w.dumps({"port": [entry.as_table(of) for entry, of in entries.items()]})
         try:
-            _replace(self.path, content.encode("utf-8"), flush=flush)
+            replace_file(self.path, content.encode("utf-8"), private=True, flush=flush)
         except OSError as error:
             self.failures += 1
             self.failure = error.strerror or type(error).__name__
@@ -326,25 +325,3 @@ def _read_floors(port: Table) -> dict[Stream, int]:
             raise port.error("stream", "every stream once", f"{system}, {component}, {link} twice")
         floors[system, component, link] = table.integer("floor", low=-1, high=LAST_TIMESTAMP)
     return floors
-
-
-def _replace(path: Path, content: bytes, *, flush: bool) -> None:
-    """Replace a file, which only we can read, at once; flushed, it stays replaced when the power fails."""
-    handle, temporary = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)  # of mode 0600
-    try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(content)
-            if flush:
-                file.flush()
-                os.fsync(file.fileno())
-        os.replace(temporary, path)
-    except BaseException:
-        with contextlib.suppress(OSError):
-            os.unlink(temporary)
-        raise
-    if flush and _POSIX:
-        folder = os.open(path.parent, os.O_RDONLY)
-        try:
-            os.fsync(folder)
-        finally:
-            os.close(folder)

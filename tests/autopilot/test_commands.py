@@ -274,6 +274,15 @@ def test_a_vehicle_that_does_not_wait_arms_itself_once_at_the_first_usable_sampl
     assert b.statements().count("armed") == 1
 
 
+def test_a_vehicle_that_missed_its_first_samples_flies_the_profile_from_sample_0_all_the_same():
+    profile = parse_profile("1deg@0.05s,2deg@0.3s", 0.025)
+    b = cockpit(wait_arm=False, profile=profile)
+    for k in range(6, 30):
+        b.sample(k, 0, X)
+    assert [c["r"][0] for c in b.commands] == [profile.r(k) for k in range(6, 30)]
+    assert {c["mode"] for c in b.commands} == {"TRACKING"}
+
+
 def test_a_vehicle_that_arms_itself_without_a_certificate_says_so():
     b = cockpit(gains=PAPER, wait_arm=False).fly(10)
     assert "armed without a verified certificate" in b.statements()
@@ -336,6 +345,19 @@ def test_disarmed_in_flight_the_next_command_is_neutral(mode):
     assert b.mode == "STANDBY"
     assert b.hear(stick).fly(1).u == 0.0
     assert not b.commands[-1]["armed"]
+
+
+@pytest.mark.parametrize("pause", [0, ALONE.d_max + 2, 60])
+def test_disarmed_while_no_state_comes_the_plant_is_sent_neutral_all_the_same(pause):
+    b = cockpit(wait_arm=False).fly(20, np.array([0.01, 0.0, 0.05]))
+    assert b.u > 0.1
+    b.to(b.now_ns + pause * TS)  # the law still flies, then HOLD, then NEUTRAL
+    assert b.mode == {0: "TRACKING", 6: "HOLD", 60: "NEUTRAL"}[pause]
+    start = len(b.messages)
+    b.result(ARM, 0.0)
+    b.to(b.now_ns + S)
+    pulses = [m.servo2_raw for port, m in b.messages[start:] if port == "plant" and m.get_type() == "SERVO_OUTPUT_RAW"]
+    assert set(pulses) == {1500}
 
 
 # modes

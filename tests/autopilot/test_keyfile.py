@@ -21,6 +21,7 @@ from autopilot.link.keyfile import (
     wall_clock_start,
 )
 from autopilot.link.signing import MAX_STREAMS, RESERVE, Signing, Timestamps, Verdict
+from gains import atomic
 from gains.table import InputError
 
 KEY = bytes(range(32))
@@ -306,7 +307,7 @@ def test_an_end_while_the_file_is_replaced_leaves_the_former_one(key_path, monke
     def ended(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(keyfile.os, "replace", ended)
+    monkeypatch.setattr(atomic.os, "replace", ended)
     signing.tick(5 * S)
     with pytest.raises(KeyboardInterrupt):
         store.pass_(5 * S)
@@ -318,7 +319,7 @@ def test_a_disk_that_fails_in_flight_is_counted_and_stops_no_frame(key_path, mon
     store, signing = run(key_path)
     heard(store, signing, 0)
     with monkeypatch.context() as patch:
-        patch.setattr(keyfile.os, "replace", _no_space)
+        patch.setattr(atomic.os, "replace", _no_space)
         signing.tick(100 * S)
         store.pass_(100 * S)
         assert (store.failures, store.failure) == (1, "No space left on device")
@@ -337,7 +338,7 @@ def _no_space(*_):
 
 
 def test_a_folder_that_cannot_be_written_is_refused_before_the_first_frame(key_path, monkeypatch):
-    monkeypatch.setattr(keyfile.os, "replace", _no_space)
+    monkeypatch.setattr(atomic.os, "replace", _no_space)
     with pytest.raises(
         InputError, match=r"autopilot\.timestamps: expected a file that can be written, found: No space"
     ):

@@ -104,6 +104,16 @@ def test_a_change_that_is_refused_leaves_everything_as_it_was(index, reason):
     assert b.node.commander.certified
 
 
+def test_gains_for_longer_delays_leave_the_window_as_it_was_until_it_is_widened():
+    b = flying()
+    b.put("GAINS", 1.0)
+    assert b.node.pilot.window == (1, 4)
+    assert b.fly(1, age_ns=110 * MS).mode == "HOLD"
+    assert b.commands[-1]["d"] == 5
+    assert b.put("DELAY_MAX", 6.0) == 6.0
+    assert b.fly(3, age_ns=110 * MS).mode == "TRACKING"
+
+
 def test_gains_for_shorter_delays_are_taken_after_a_narrower_window():
     b = flying()
     refused(b, "GAINS", 2.0, "hirm-d3: delay 1..3, flown 1..4")
