@@ -444,7 +444,8 @@ class Pilot:
             self.event(event, missing or f"no state for {self._patience} samples", now_ns)
         elif self.mode is Mode.HOLD:
             self.event(Event.EXPIRED, "no recovery", now_ns)
-        if self.mode is not Mode.NEUTRAL or self._last is None or self.config.failsafe != "on":
+        neutral = self.mode is Mode.NEUTRAL and self.config.failsafe == "on"
+        if self._last is None or not (neutral or self.mode is Mode.STANDBY):
             return False
         self._u, self._saturated = self.travel.neutral, False
         self._plausibility.commanded(self._u)
@@ -473,6 +474,8 @@ class Pilot:
                 return self.failsafe.since_ns + self.limits.hold_ns
             case Mode.NEUTRAL if self.config.failsafe == "on":
                 return self._next_repeat_ns
+            case Mode.STANDBY if not self._commander.engaged and self._stale_ns and self._next_repeat_ns:
+                return max(self._stale_ns, self._next_repeat_ns)  # neutral, also where no sample asks for it
             case _:
                 return None
 

@@ -136,10 +136,12 @@ def stick(x: int) -> dialect.MAVLink_message:
     return dialect.MAVLink_manual_control_message(1, x, 0, 0, 0, 0)
 
 
-def attitude(pitch_deg: float, roll_deg: float = 0.0, yaw_deg: float = 0.0) -> dialect.MAVLink_message:
-    """Return SET_ATTITUDE_TARGET of a yaw, a pitch and a roll, by SciPy."""
+def attitude(
+    pitch_deg: float, roll_deg: float = 0.0, yaw_deg: float = 0.0, stamp_ms: int = 0
+) -> dialect.MAVLink_message:
+    """Return SET_ATTITUDE_TARGET of a yaw, a pitch and a roll, by SciPy; a stamp of 0 says nothing."""
     x, y, z, w = Rotation.from_euler("ZYX", [yaw_deg, pitch_deg, roll_deg], degrees=True).as_quat()
-    return dialect.MAVLink_set_attitude_target_message(0, 1, 1, IGNORE_RATES, [w, x, y, z], 0.0, 0.0, 0.0, 0.5)
+    return dialect.MAVLink_set_attitude_target_message(stamp_ms, 1, 1, IGNORE_RATES, [w, x, y, z], 0.0, 0.0, 0.0, 0.5)
 
 
 def pitch_rate(deg_s: float) -> dialect.MAVLink_message:
@@ -315,6 +317,18 @@ def test_a_pitch_rate_moves_the_reference_at_that_rate_from_where_it_is():
     for c in flight.after(3.2, 5.0):
         expected = still[-1] - math.radians(1.5) * 0.025 * (c["j"] - begun + 1)
         assert c["r"][0] == pytest.approx(expected, abs=1e-7)
+
+
+def test_setpoints_that_were_overtaken_or_are_no_numbers_are_refused_and_change_nothing():
+    good = [(2.0 + n / 20, attitude(2.0, stamp_ms=90_000 + 50 * n)) for n in range(60)]
+    late = [(2.01 + n / 20, attitude(9.0, stamp_ms=90_000 + 50 * n - 300)) for n in range(60)]
+    nan = dialect.MAVLink_set_attitude_target_message(0, 1, 1, IGNORE_RATES, [math.nan] * 4, 0.0, 0.0, 0.0, 0.5)
+    flight = GroundFlight(5, [(1.9, mode(GUIDED))], good, late, every(nan, 2.3, 4.9))
+    assert r_of(flight.after(2.2, 5.0)[:-1]) == pytest.approx(math.radians(2.0), abs=1e-7)
+    assert flight.node.commander.refused == len(late) + 52
+    # what is refused keeps nothing alive: 1 s after the last good one the stream is silent
+    silent = GroundFlight(5, [(1.9, mode(GUIDED))], good[:20], late[:20], every(nan, 2.3, 4.9))
+    assert silent.told("GUIDED: silence, holding trim") == [pytest.approx(2.95 + 1.0, abs=2 * MS / S)]
 
 
 def wandering(since_s: float, until_s: float, most_deg: float, seed: int = 5) -> list[Timed]:
