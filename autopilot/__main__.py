@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from contextlib import closing
 from functools import partial
 from pathlib import Path
 from typing import Literal
@@ -14,6 +15,7 @@ from autopilot.alpha import AlphaChoice
 from autopilot.app import AutopilotNode
 from autopilot.config import AutopilotConfig, Home
 from autopilot.ground.parameterfile import ParameterFile
+from autopilot.ground.settings import Settings
 from autopilot.link.clock import NS_PER_S, Clock
 from autopilot.link.keyring import CONTROL_LINK, Keyring, ground_link
 from autopilot.link.process import ADDRESS, Parsed, ProcessOptions, process_options, run_node
@@ -184,6 +186,9 @@ def cli(
     stations = [ADDRESS.convert(text, None, None) for text in gcs if text != "none"]
     if len(stations) > MAX_GROUND_STATIONS:
         raise InputError(f"--gcs: expected at most {MAX_GROUND_STATIONS} ground stations, found {len(stations)}")
+    if parameters_file is not None and not parameters_file.absolute().parent.is_dir():
+        raise InputError(f"{parameters_file}: expected a file in a folder that exists, found no such folder")
+    options = ProcessOptions(clock, record, stream)
     keyring = Keyring("autopilot", clock)
     config = AutopilotConfig(
         gains=gains,
@@ -204,13 +209,33 @@ def cli(
     )
     if isinstance(gains, Schedule) and gains.certificate is not None:  # of all switching: it may take half a minute
         click.echo(f"autopilot: checking the certificate of schedule {gains.name}", err=True)
-    node = AutopilotNode(config)
-    proof = node.proof
-    for each, verification in ((gains, proof), (gains.conservative, node.conservative_proof)):
-        if require_certificate and each is not None and verification is not None and not verification.passed:
-            reason = f"no verified certificate ({verification.reason}), but --require-certificate"
-            which = "gains" if each is gains else "conservative gains"
-            raise InputError(f"{which} {each.name}: {reason}")
+    with closing(keyring):
+        node = AutopilotNode(config)
+        if require_certificate:
+            _require_certificates(node.settings)
+        _run(node, keyring, options, plant, stations)
+
+
+def _require_certificates(settings: Settings) -> None:
+    """Refuse laws without a verified certificate, all that may be flown.
+
+    Raises
+    ------
+    InputError
+        Naming the first.
+    """
+    for law, proof, wide in zip(settings.laws, settings.proofs, settings.conservative_proofs, strict=True):
+        for which, each, verification in (("gains", law, proof), ("conservative gains", law.conservative, wide)):
+            if each is not None and verification is not None and not verification.passed:
+                reason = f"no verified certificate ({verification.reason}), but --require-certificate"
+                raise InputError(f"{which} {each.name}: {reason}")
+
+
+def _run(
+    node: AutopilotNode, keyring: Keyring, options: ProcessOptions, plant: Address, stations: Sequence[Address]
+) -> None:
+    """Open the ports, say what flies, and fly until told to end."""
+    gains, proof = node.pilot.gains, node.proof
     openers = [partial(dial, "plant", plant), *(partial(dial, f"gcs{i}", a) for i, a in enumerate(stations))]
     proved = "certificate verified" if proof.passed else "no verified certificate"
     windows = ", ".join(f"{d_min}..{d_max}" for d_min, d_max in node.windows)
@@ -222,7 +247,6 @@ def cli(
         )
     banner = f"autopilot: gains {gains.name} ({proved}){scheduled}{also}, plant {plant[0]}:{plant[1]}"
     metadata = {"program": "autopilot", "gains": gains.name, "version": version()}
-    options = ProcessOptions(clock, record, stream)
     run_node("autopilot", node, openers, options, metadata, tap=True, banner=banner, keyring=keyring)
 
 

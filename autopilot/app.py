@@ -31,6 +31,7 @@ from autopilot.link.wire import (
     HilActuatorControls,
     Message,
     NamedValueInt,
+    Reject,
     ServoOutputRaw,
     Severity,
     Timesync,
@@ -56,6 +57,7 @@ SYNC_WAIT_NS = 2 * NS_PER_S
 COUNTERS_NS = NS_PER_S
 RATES_AND_THRUST_IGNORE = 1 | 2 | 4 | 64
 """ATTITUDE_TARGET_TYPEMASK: body rates and thrust are not meant."""
+NOT_SIGNED = (Reject.UNSIGNED, Reject.BAD_SIGNATURE)
 HALF_NS = NS_PER_S
 """Half of the state may be missing for so long before that is said."""
 
@@ -113,6 +115,7 @@ class AutopilotNode:
         self._alpha_told: AlphaSource | None = None
         self._half_told: str | None = None
         self._told: Command | None = None
+        self._unsigned_told: set[str] = set()
         self._next_heartbeat_ns: int | None = None
         self._next_timesync_ns: int | None = None
         self._next_counters_ns: int | None = None
@@ -179,6 +182,7 @@ class AutopilotNode:
             self._next_counters_ns = following(self._next_counters_ns, COUNTERS_NS, now_ns)
             self._record_counters(now_ns)
             self._tell_missing_half(now_ns)
+            self._tell_unsigned()
         self._periodic_ns = self._next_periodic_ns()
 
     def next_deadline_ns(self) -> int | None:
@@ -241,6 +245,13 @@ class AutopilotNode:
             self._event("half", missing, now_ns)
         self._half_told = missing
 
+    def _tell_unsigned(self) -> None:
+        """Say once of each port that frames without a valid signature come: most often a key that is missing."""
+        for port, wire in {PLANT_PORT: self.wire, **self.vehicle.wires}.items():
+            if port not in self._unsigned_told and any(wire.rejects[kind] for kind in NOT_SIGNED):
+                self._unsigned_told.add(port)
+                self.vehicle.say(Severity.WARNING, f"{port}: frames without a valid signature")
+
     def _timesync(self, message: Timesync, now_ns: int) -> None:
         if message.tc1 == 0:
             self._send(Timesync(max(1, now_ns), message.ts1))  # a reply of 0 would be a request
@@ -286,6 +297,8 @@ class AutopilotNode:
         self.halves.forget()
         self.pilot.restart()
         self._event("epoch", f"{why}, epoch {self.epoch}", now_ns)
+        if self.pilot.mode is Mode.STANDBY:  # else failsafe says so
+            self.vehicle.say(Severity.WARNING, why)
         self.pilot.event(Event.RESTARTED, why, now_ns)
 
     # One command per sample
@@ -398,12 +411,16 @@ class AutopilotNode:
         self.vehicle.banner = banner(gains, self.proof, self.conservative_proof)
         for text in self.vehicle.banner:
             self.vehicle.say(text.severity, text.text)
+        low, high = self.pilot.window
+        self.vehicle.say(Severity.INFO, f"flown at delay {low}..{high} of {gains.d_min}..{gains.d_max}")
         self._announce_gains(now_ns)
 
     @property
     def _degraded(self) -> bool:
-        """Whether failsafe has the elevator, or flies with less than is asked for."""
-        return self.commander.engaged and self.pilot.mode not in (Mode.TRACKING, Mode.STANDBY)
+        """Whether failsafe has the elevator, or flies with less than is asked for; or a stick has no aircraft."""
+        if self.commander.engaged:
+            return self.pilot.mode not in (Mode.TRACKING, Mode.STANDBY)
+        return self.pilot.silent
 
     def _unready(self, now_ns: int) -> list[str]:
         """Return what keeps the law from flying now."""

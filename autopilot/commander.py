@@ -17,7 +17,7 @@ modes have the numbers of ArduPlane, so every ground station knows their names. 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from dataclasses import dataclass
 from enum import IntEnum
 
@@ -118,7 +118,7 @@ class Commander:
     require_certificate : bool
         Whether the ground can arm only gains with a verified certificate.
     refused : int
-        Setpoints that were out of order, or made no sense.
+        Setpoints and sticks that were out of order, made no sense, or came while another station's were flown.
     """
 
     def __init__(
@@ -143,7 +143,9 @@ class Commander:
         self._target: Target = Programmed()
         self._stick = 0.0
         self._heard_ns: int | None = None
-        self._stamps: dict[tuple[int, int], int] = {}
+        self._owner: Hashable = None
+        self._rival_told = False
+        self._stamps: dict[Hashable, int] = {}
 
     # What is asked by the pilot
 
@@ -161,6 +163,11 @@ class Commander:
     def stick(self) -> float:
         """Where the elevator is asked to be in MANUAL, from -1 (nose down) to 1; 0 while disarmed."""
         return self._stick if self.armed and self.mode is FlightMode.MANUAL else 0.0
+
+    @property
+    def waiting(self) -> bool:
+        """Whether the vehicle is still to arm by itself."""
+        return self._self_arm
 
     @property
     def released_by(self) -> str:
@@ -212,12 +219,12 @@ class Commander:
 
     def _begin(self, now_ns: int) -> None:
         """Let the reference of the mode begin; a stream or a stick has its time to come."""
-        self._stick, self._heard_ns = 0.0, None
+        self._stick, self._heard_ns, self._rival_told = 0.0, None, False
         self._target = Programmed() if self.mode is FlightMode.AUTO else Steady()
 
-    # Stick and setpoints
+    # Stick and setpoints: who is heard first is heard until it falls silent, so that two stations cannot pull in turn
 
-    def attitude_target(self, message: SetAttitudeTarget, sender: tuple[int, int], now_ns: int) -> None:
+    def attitude_target(self, message: SetAttitudeTarget, sender: Hashable, now_ns: int) -> None:
         """Take a setpoint; only GUIDED flies one."""
         if self.mode is not FlightMode.GUIDED or not self._in_order(sender, message.time_boot_ms):
             return
@@ -230,11 +237,23 @@ class Commander:
         if target is None:
             self.refused += 1
             return
-        self._heard_ns = now_ns
+        if not self._owns(sender, now_ns):
+            return
         if target != self._target:
             self._target = target
 
-    def _in_order(self, sender: tuple[int, int], stamp_ms: int) -> bool:
+    def _owns(self, sender: Hashable, now_ns: int) -> bool:
+        """Return whether a sender is the one whose stream or stick is flown; tell once when another wants to be."""
+        if self._heard_ns is not None and sender != self._owner:
+            self.refused += 1
+            if not self._rival_told:
+                self._rival_told = True
+                self._tell(Severity.WARNING, f"{self.mode.name}: another station has the stick", now_ns)
+            return False
+        self._owner, self._heard_ns = sender, now_ns
+        return True
+
+    def _in_order(self, sender: Hashable, stamp_ms: int) -> bool:
         """Return whether a setpoint is newer than the newest of its sender; a stamp of 0 says nothing."""
         newest = self._stamps.get(sender)
         late = newest is not None and 0 < (newest - stamp_ms) % (1 << 32) < STALE_STAMP_MS
@@ -246,26 +265,29 @@ class Commander:
         self._stamps[sender] = stamp_ms
         return True
 
-    def manual_control(self, message: ManualControl, now_ns: int) -> None:
+    def manual_control(self, message: ManualControl, sender: Hashable, now_ns: int) -> None:
         """Take a stick: x forward is nose down, as ArduPlane has it."""
         if not -1000 <= message.x <= 1000:
             self.refused += message.x != 32767
             return
-        self._move_stick(-message.x / 1000.0, now_ns)
+        self._move_stick(-message.x / 1000.0, sender, now_ns)
 
-    def rc_override(self, message: RcChannelsOverride, now_ns: int) -> None:
+    def rc_override(self, message: RcChannelsOverride, sender: Hashable, now_ns: int) -> None:
         """Take a stick as a pulse: long is nose up, as ArduPlane has it; 0 gives it back."""
         if message.chan2_raw == 0:
-            self._move_stick(0.0, now_ns)
+            if self._heard_ns is not None and sender == self._owner:
+                self._move_stick(0.0, sender, now_ns)
+                self._heard_ns = None  # given back: nobody to miss
         elif PULSE_LOW_US <= message.chan2_raw <= PULSE_HIGH_US:
-            self._move_stick(max(-1.0, min(1.0, (message.chan2_raw - STICK_CENTRE_US) / STICK_REACH_US)), now_ns)
+            self._move_stick(
+                max(-1.0, min(1.0, (message.chan2_raw - STICK_CENTRE_US) / STICK_REACH_US)), sender, now_ns
+            )
         else:
             self.refused += message.chan2_raw != 65535
 
-    def _move_stick(self, stick: float, now_ns: int) -> None:
-        if self.mode not in (FlightMode.MANUAL, FlightMode.STABILIZE):
+    def _move_stick(self, stick: float, sender: Hashable, now_ns: int) -> None:
+        if self.mode not in (FlightMode.MANUAL, FlightMode.STABILIZE) or not self._owns(sender, now_ns):
             return
-        self._heard_ns = now_ns
         self._stick = stick
         if self.mode is FlightMode.STABILIZE and self._target != Steady(stick * self.stick_rad):
             self._target = Steady(stick * self.stick_rad)
@@ -277,11 +299,17 @@ class Commander:
         due_ns = self.next_deadline_ns()
         if due_ns is None or now_ns < due_ns:
             return
-        self._heard_ns = None
+        self._heard_ns, self._rival_told = None, False
         self._stick = 0.0
-        if self.mode is not FlightMode.MANUAL:
-            self._target = Steady()
+        if self.mode is FlightMode.MANUAL:
+            self._tell(Severity.WARNING, "MANUAL: silence, elevator neutral", now_ns)
+            return
+        self._target = Steady()
         self._tell(Severity.WARNING, f"{self.mode.name}: silence, holding trim", now_ns)
+
+    def warn(self, text: str, now_ns: int) -> None:
+        """Tell people of what they must know while no law flies, and failsafe therefore says nothing."""
+        self._tell(Severity.WARNING, text, now_ns)
 
     def next_deadline_ns(self) -> int | None:
         """Return when a silence is too long."""

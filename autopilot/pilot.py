@@ -8,6 +8,7 @@ Between samples: what follows from silence. The rules are elsewhere (``commander
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -42,7 +43,10 @@ REPORT_NS = NS_PER_S
 _USABLE = (Event.GOOD, Event.WIDE)
 """The samples that some law may fly on."""
 _TRIM = Steady()
+_STILL = Moving(0.0)
 _NO_LIMITS = (-sys.float_info.max, sys.float_info.max)
+_UPRIGHT = (-math.pi / 2, math.pi / 2)
+"""A reference that is a pitch never goes further from trim."""
 
 
 class Command(NamedTuple):
@@ -148,6 +152,10 @@ class Pilot:
         self._missing = missing
         self._Ts_ns = self.model.Ts_ns
         self._sense = elevator_sense(self.model)
+        self._limits = _NO_LIMITS if pitch_index(self.model) is None else _UPRIGHT
+        longest = max(law.d_max for law in (config.gains, *config.alternatives))
+        self._plausibility = Plausibility(self.model, max(COMMAND_MEMORY, longest))
+        self._u = self.travel.neutral
         self.use(config.gains)
         self.restart()
 
@@ -161,13 +169,13 @@ class Pilot:
         self.limits = replace(self.limits, conservative=self.conservative is not None)
         self.chooser = SetChooser(self.windows)
         self._chosen = ChosenSets(self.windows)
-        self._plausibility = Plausibility(self.model, max(COMMAND_MEMORY, gains.d_max))
         self._law_changed = True
         self.set_travel(self.travel)
 
     def set_travel(self, travel: Travel) -> None:
-        """Give the elevator other stops."""
+        """Give the elevator other stops; what is held now keeps them, too."""
         self.travel = travel
+        self._u = travel.clip(self._u)
         self._laws = [law_of(each, travel) for each in self.sets]
         self._conservative_law = law_of(self.conservative, travel) if self.conservative is not None else None
 
@@ -178,7 +186,7 @@ class Pilot:
         self._target: Target | None = None
         self._program: tuple[Programmed, int] | None = None
         self._ahead = 0
-        self._idle = self._law_changed = False
+        self._idle = self._law_changed = self._silence_told = False
         self._worth_last: tuple[Event, str] | None = None
         self.chooser = SetChooser(self.windows)
         self._chosen = ChosenSets(self.windows)
@@ -231,14 +239,19 @@ class Pilot:
         engaged = self._engage(*self._worth(sample, forecast, now_ns), now_ns)
         chosen = self.chooser.choose(forecast.d, forecast.low, forecast.high)
         law, gains, gain_set = self._in_force(chosen)
-        xr, r = self._look(sample, forecast, gains, was)
+        flown = engaged and law is not None
+        xr, r = self._look(sample, forecast, gains, was, flown=flown)
         if not engaged:
             self._u, self._saturated = self._stick_u(), False
         elif law is not None:
             self._u, self._saturated = law.command(sample.x, xr)
         elif self.mode is not Mode.HOLD:
             self._u, self._saturated = self.travel.neutral, False
-        self._idle = not engaged
+        # another hand had the elevator, or nobody, until a law really flies; but not before the flight began
+        self._idle = not (engaged or self._commander.waiting) or (self._idle and self.mode is Mode.STANDBY)
+        self._silence_told = False
+        if self.mode in FLOWN_BY_FIRST_LAW:
+            self._chosen.note(sample.j, gain_set)
         self._stale_ns = now_ns + self._patience * self._Ts_ns + self._Ts_ns // 4
         commander = self._commander
         return Command(
@@ -257,8 +270,6 @@ class Pilot:
 
     def sent(self, command: Command) -> None:
         """Take note of a command that has left; what follows from it alone could wait until now."""
-        if command.mode in FLOWN_BY_FIRST_LAW:
-            self._chosen.note(command.sample.j, command.gain_set)
         self._plausibility.commanded(command.u)
         self._next_repeat_ns = command.at_ns + self._Ts_ns
         if event := self.saturation.told(command.saturated, command.at_ns):
@@ -332,43 +343,51 @@ class Pilot:
     # The reference
 
     def _look(
-        self, sample: Sample, forecast: DelayEstimate, gains: Gains, was: Mode
+        self, sample: Sample, forecast: DelayEstimate, gains: Gains, was: Mode, *, flown: bool
     ) -> tuple[tuple[float, ...], float]:
-        """Return the reference state that the command carries, xr(j + d), and r(j)."""
+        """Return the reference state that the command carries, xr(j + d), and r(j).
+
+        While no law flies nobody follows what is looked ahead to, so it reaches no further than the window: r is
+        promised up to there, and a setpoint waits until then.
+        """
         reference = self.reference
         if reference is None:
             return (), 0.0
         reference.advance(sample.j)
         ahead = 0
         if self.config.align:
-            unknown, most = self.window[0], self.window[1] + MAX_AHEAD
+            unknown, most = self.window[0], self.window[1] + (MAX_AHEAD if flown else 0)
             ahead = min(forecast.d, most) if forecast.d is not None else unknown
         self._ahead = ahead
         target = self._wanted_target()
         if target is not self._target:
             self._aim(target)
-        if self.config.failsafe == "on" and self._takes_over(was):
+        if flown and self._takes_over(was):
             self._match_reference(reference, sample, gains, ahead)
-        self._law_changed = False
+        if flown:
+            self._law_changed = False
         return reference.ahead(ahead), self._source.r(sample.j)
 
     def _takes_over(self, was: Mode) -> bool:
         """Return whether a law takes over from a hand, from the last command, from neutral, or from another law."""
-        if self.mode not in FLOWN_BY_LAW:
-            return False
-        return _enters(was, self.mode) or self._law_changed or (was is Mode.STANDBY and self._idle)
+        if self._law_changed or self._idle:
+            return True
+        return self.config.failsafe == "on" and _enters(was, self.mode)
 
     def _wanted_target(self) -> Target:
         """Return the reference that is to be flown: the ground's, eased to trim while the ground is lost."""
-        eased = self.failsafe.ground_lost and self.config.failsafe == "on"
-        return _TRIM if eased else self._commander.target
+        on = self.config.failsafe == "on"
+        target = _TRIM if on and self.failsafe.ground_lost else self._commander.target
+        if isinstance(target, Moving) and on and self.mode not in FLOWN_BY_LAW:
+            return _STILL  # nobody follows
+        return target
 
     def _aim(self, target: Target) -> None:
         """Follow another reference, from the first sample on that no command has looked ahead to."""
         first = self._target is None
         self._target = target
         source, max_rate = self._source, self.max_rate
-        source.set_limits(*((-self.max_pitch, self.max_pitch) if self.max_pitch is not None else _NO_LIMITS))
+        source.set_limits(*((-self.max_pitch, self.max_pitch) if self.max_pitch is not None else self._limits))
         match target:
             case Steady(pitch):
                 source.set_target(pitch, max_rate)
@@ -447,11 +466,19 @@ class Pilot:
         neutral = self.mode is Mode.NEUTRAL and self.config.failsafe == "on"
         if self._last is None or not (neutral or self.mode is Mode.STANDBY):
             return False
-        self._u, self._saturated = self.travel.neutral, False
+        if not neutral and not self._silence_told and self._stale_ns is not None and now_ns >= self._stale_ns:
+            self._silence_told = True
+            self._commander.warn(f"no state for {self._patience} samples, {self._commander.released_by}", now_ns)
+        self._u, self._saturated = self.travel.neutral if neutral else self._stick_u(), False
         self._plausibility.commanded(self._u)
         self.saturation.told(saturated=False, now_ns=now_ns)
         self._next_repeat_ns = now_ns + self._Ts_ns
         return True
+
+    @property
+    def silent(self) -> bool:
+        """Whether no samples come while no law is to fly."""
+        return self._silence_told
 
     @property
     def u(self) -> float:
@@ -475,7 +502,9 @@ class Pilot:
             case Mode.NEUTRAL if self.config.failsafe == "on":
                 return self._next_repeat_ns
             case Mode.STANDBY if not self._commander.engaged and self._stale_ns and self._next_repeat_ns:
-                return max(self._stale_ns, self._next_repeat_ns)  # neutral, also where no sample asks for it
+                # also where no sample asks for it: the stick, or neutral, and that at once
+                waits = self._u == self._stick_u()
+                return max(self._stale_ns, self._next_repeat_ns) if waits else self._next_repeat_ns
             case _:
                 return None
 

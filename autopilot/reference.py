@@ -71,11 +71,6 @@ class ReferenceModel:
         """Put the state at sample k elsewhere."""
         self._states = deque([xr])
 
-    def follow(self, source: Source) -> None:
-        """Follow another source from here on; the state stays."""
-        self.source = source
-        self.set(self.xr)
-
     def advance(self, j: int) -> Vector:
         """Move the state on to sample j and return xr(j); an earlier sample than the present one moves nothing."""
         while self.k < j and len(self._states) > 1:

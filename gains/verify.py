@@ -22,7 +22,7 @@ from gains.verify_switched import check_switched
 __all__ = ["Verification", "check", "least_eta", "verified"]
 
 
-@lru_cache(maxsize=16)  # gains never change, and a schedule may take many seconds
+@lru_cache(maxsize=64)  # gains never change, and a schedule may take many seconds
 def verified(gains: GainLaw) -> Verification:
     """Return whether the certificate in a gain file proves its whole window of delays.
 

@@ -81,6 +81,8 @@ class FlightData:
         How late each tick was served, ns.
     output, reference, error : ndarray, shape (N, ny)
         y = C x + D u and yr, both absolute, and e = y - yr (10), in units of the outputs.
+    engaged : ndarray of bool, shape (N,)
+        Whether the law was to fly: neither disarmed nor in MANUAL.
     command_s : ndarray, shape (M,)
         Time of the sample j of each command, s; ascending.
     command_j : ndarray of int, shape (M,)
@@ -111,6 +113,7 @@ class FlightData:
     output: Matrix
     reference: Matrix
     error: Matrix
+    engaged: NDArray[np.bool_]
     command_s: Matrix
     command_j: NDArray[np.int64]
     xr: Matrix
@@ -166,6 +169,7 @@ class FlightData:
             output=deviation + trim,
             reference=yr + trim,
             error=deviation - yr,
+            engaged=_engaged(samples, places, commands),
             command_s=np.array(places, dtype=np.float64) * model.Ts,
             command_j=_integers(commands, "j"),
             xr=_rows(commands, "xr", model.nr),
@@ -182,9 +186,14 @@ class FlightData:
 
     @property
     def rms_error(self) -> Matrix:
-        """Root of the mean of e² over the flight, per output; shape (ny,)."""
+        """Root of the mean of e² over the samples at which the law was to fly, per output; shape (ny,)."""
         with np.errstate(over="ignore"):  # a flight that diverged
-            return np.asarray(np.sqrt(np.mean(self.error**2, axis=0)), dtype=np.float64)
+            return np.asarray(np.sqrt(np.mean(self.flown_error**2, axis=0)), dtype=np.float64)
+
+    @property
+    def flown_error(self) -> Matrix:
+        """The error where the law was to fly; all of it in a flight in which that was never so."""
+        return self.error[self.engaged] if self.engaged.any() else self.error
 
 
 @dataclass(slots=True)
@@ -254,6 +263,12 @@ class _Collected:
         offset_ns = int(np.median(offsets_ns)) if len(records) else 0
         entered_s = (sent_ns + offset_ns - (self.zero_ns or 0)) / 1e9
         return LinkPackets(entered_s, np.where(arrived, (left_ns - sent_ns) / 1e9, np.nan))
+
+
+def _engaged(samples: NDArray[np.int64], places: list[int], commands: list[Mapping[str, Any]]) -> NDArray[np.bool_]:
+    """Return whether the law was to fly at each sample, as the latest command says; before the first one it was."""
+    said = np.array([True, *(body.get("armed", True) and body.get("flight_mode") != "MANUAL" for body in commands)])
+    return said[np.searchsorted(np.array(places, dtype=np.int64), samples, side="right")]
 
 
 def _reference_inputs(model: Model, found: _Collected, metadata: Mapping[str, str]) -> Callable[[int], Matrix]:

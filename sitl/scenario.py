@@ -67,6 +67,7 @@ METRICS = frozenset(
     {
         "duration_s",
         "samples",
+        "released_s",
         "rms_error_rad",
         "max_error_rad",
         "final_error_rad",
@@ -273,7 +274,7 @@ def _parse(table: Table, name: str, gains_name: str | None, plant_name: str | No
         plant=plant,
         duration_s=table.number("duration_s", above=0.0, high=86_400.0),
         seed=table.integer("seed", default=1, low=0, high=MAX_SEED),
-        reference=table.string("reference", default=""),
+        reference=_reference(table),
         up=up,
         down=down,
         clocks={
@@ -322,6 +323,12 @@ def _witness_name(table: Table, link: Table | None) -> str | None:
     """Return the witness file of ``[link]``, to which the scenario's folder is the place to start from."""
     name = link.string("witness", default=None) if link is not None else None
     return None if name is None else str(table.folder / name)
+
+
+def _reference(table: Table) -> str:
+    """Return the programmed reference; a file that it names is looked for from the scenario's folder."""
+    text: str = table.string("reference", default="")
+    return f"file:{table.folder / text.removeprefix('file:')}" if text.startswith("file:") else text
 
 
 def _servo_timeout(table: Table, default: int | None) -> int | None:

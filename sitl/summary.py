@@ -60,9 +60,10 @@ def summarise(scenario: Scenario, kept: Sequence[Kept], flight: FlightData, *, v
     """Return the summary of a flight as ``sitl fly --json`` prints it, without files, variants and checks.
 
     Errors are e = C x + D u - yr, Eq. (10), in the units of the outputs, against the reference model that
-    starts at rest at k = 0 and is never re-initialised: what failsafe costs is in them.
+    starts at rest at k = 0 and is never re-initialised: what failsafe costs is in them. Samples at which no law was to
+    fly, as the ground had disarmed the vehicle or flew it by hand, are left out.
     """
-    error = np.abs(flight.error[:, 0])
+    error = np.abs(flight.flown_error[:, 0])
     last_second = max(1, round(1.0 / scenario.plant.Ts))
     transitions = [body for topic, _, body in kept if topic == "events" and body["kind"] == "failsafe"]
     leaving = [t for t in transitions if t["data"]["from"] != Mode.STANDBY]
@@ -77,6 +78,7 @@ def summarise(scenario: Scenario, kept: Sequence[Kept], flight: FlightData, *, v
         "conservative": _conservative(scenario.gains),
         "duration_s": len(flight.time_s) * scenario.plant.Ts,
         "samples": len(flight.time_s),
+        "released_s": int(np.count_nonzero(~flight.engaged)) * scenario.plant.Ts,
         "diverged": any(topic == "events" and body["kind"] == "diverged" for topic, _, body in kept),
         "rms_error_rad": float(flight.rms_error[0]),
         "max_error_rad": float(error.max()),
@@ -261,7 +263,9 @@ def summary_table(summary: Mapping[str, Any], verdicts: Sequence[Verdict]) -> Gr
         wide = summary["conservative"]
         grid.add_row("conservative gains", f"{wide['gains']} (certificate: {wide['certificate']})")
     rms, peak, final = (np.degrees(summary[f"{m}_error_rad"]) for m in ("rms", "max", "final"))
-    grid.add_row("tracking error", f"rms {rms:.3g}°, largest {peak:.3g}°, last second {final:.3g}°")
+    released_s = summary["released_s"]
+    released = f"; without {released_s:.3g} s disarmed or by hand" if released_s else ""
+    grid.add_row("tracking error", f"rms {rms:.3g}°, largest {peak:.3g}°, last second {final:.3g}°{released}")
     grid.add_row("true delay", _histogram_text(delay["true_histogram"]))
     grid.add_row("forecast", _forecast_text(delay))
     for way, counts in summary["link"].items():

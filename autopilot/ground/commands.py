@@ -11,7 +11,7 @@ from typing import NamedTuple, Protocol
 
 from autopilot.commander import Commander, FlightMode
 from autopilot.ground.services import autopilot_version, available_modes
-from autopilot.ground.streams import STREAMED, Streams
+from autopilot.ground.streams import MAX_INTERVAL_NS, STREAMED, Streams
 from autopilot.link.clock import NS_PER_US
 from autopilot.link.groundmessages import (
     AutopilotVersion,
@@ -31,8 +31,6 @@ FORCE = (21196.0, 2989.0)
 """COMPONENT_ARM_DISARM: ArduPilot's and QGroundControl's words for force, in param2."""
 PX4_OFFBOARD = 6
 """The custom mode by which MAVSDK asks for streamed setpoints: GUIDED here. ArduPlane's mode 6 does not exist here."""
-MAX_INTERVAL_US = (1 << 31) - 1
-"""What MESSAGE_INTERVAL can say."""
 MAX_TEXT = 50
 
 
@@ -56,6 +54,9 @@ class Handled(NamedTuple):
 
 class Storage(Protocol):
     """Parameters on disk."""
+
+    def busy(self, now_ns: int) -> bool:
+        """Return whether it was asked for too often."""
 
     def save(self) -> str | None:
         """Write them, and return why that was not possible."""
@@ -154,6 +155,8 @@ def _mode(asked: Asked) -> Handled:
 
 def _storage(asked: Asked) -> Handled:
     storage = asked.storage
+    if storage.busy(asked.now_ns):
+        return Handled(MavResult.TEMPORARILY_REJECTED)
     if asked.p1 == 1.0:
         reason = storage.save()
     elif asked.p1 == 0.0:
@@ -173,7 +176,7 @@ def _set_interval(asked: Asked) -> Handled:
         asked.streams.ask_default(message, asked.now_ns)
     elif asked.p2 == -1.0:
         asked.streams.ask(message, None, asked.now_ns)
-    elif 0.0 < asked.p2 <= MAX_INTERVAL_US:
+    elif 0.0 < asked.p2 * NS_PER_US <= MAX_INTERVAL_NS:
         asked.streams.ask(message, round(asked.p2 * NS_PER_US), asked.now_ns)
     else:
         return Handled(MavResult.DENIED)

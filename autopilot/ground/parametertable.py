@@ -102,7 +102,7 @@ def _rate(name: str, message: str, default: float) -> Parameter:
 
 GAINS: Final = "GAINS"
 """The parameter that is kept in a file by the name of the gain set, because its number depends on the list."""
-_OF_GAINS = "inside the window of the gains, its default"
+_OF_GAINS = "inside the window of the gains; default: that of the gains given at start"
 _OF_MODEL = "inside the model's travel, its default"
 
 PARAMETERS: Final = (

@@ -24,6 +24,9 @@ from gains.verify import Verification
 
 __all__ = ["Settings"]
 
+STORAGE_NS = NS_PER_S
+STORAGE_MOST = 5
+"""So many commands in that time, ns, may read or write parameters."""
 NO_LIMIT_DEG = 90.0
 """REF_MAX_DEG: no limit; also where the reference is no pitch."""
 
@@ -69,10 +72,13 @@ class Settings:
                 raise InputError(f"gains {law.name}: expected the model {laws[0].model.name}, found {law.model.name}")
         self.laws = tuple(laws)
         self.proofs = [verify(law) for law in laws]
+        self.conservative_proofs = [None if law.conservative is None else verify(law.conservative) for law in laws]
         self._pilot = pilot
         self._commander = commander
         self._flown = flown
         self._store = store
+        self._stored_ns: int | None = None
+        self._stored_more = 0
         self._neutral_deg = math.degrees(pilot.travel.neutral)
         stops = math.degrees(pilot.travel.low), math.degrees(pilot.travel.high)
         delays = min(law.d_min for law in laws), max(law.d_max for law in laws)
@@ -100,6 +106,14 @@ class Settings:
 
     # Parameters on disk (autopilot.ground.commands.Storage)
 
+    def busy(self, now_ns: int) -> bool:
+        """Return whether storage was asked for too often: a disk must not have the elevator's time."""
+        if self._stored_ns is not None and now_ns - self._stored_ns < STORAGE_NS:
+            self._stored_more += 1
+        else:
+            self._stored_ns, self._stored_more = now_ns, 0
+        return self._stored_more >= STORAGE_MOST
+
     def save(self) -> str | None:
         """Keep the present values, and return why that was not possible."""
         if self._store is None:
@@ -116,8 +130,9 @@ class Settings:
             return "parameters: started without --parameters"
         try:
             kept = self._store.read()
-            changed = self.parameters.reset(now_ns) if kept is None else self.parameters.load(kept, now_ns)
-            self.parameters.announce(changed)
+            if kept is None:
+                return "parameters: none are saved"
+            self.parameters.announce(self.parameters.load(kept, now_ns))
         except InputError as error:
             return f"parameters: {error}"
         return None
@@ -166,7 +181,7 @@ class Settings:
         undone = index == int(self.parameters.value("GAINS"))  # taken back, since another value was refused
         if not undone:
             if not law.d_min <= window[0] <= window[1] <= law.d_max:
-                return f"{law.name}: delay {law.d_min}..{law.d_max}, flown {window[0]}..{window[1]}"
+                return f"{law.name}: {law.d_min}..{law.d_max}; window now {window[0]}..{window[1]}"
             if self._commander.armed and not proof.passed:
                 return f"{law.name}: armed, and no verified certificate"
         self._pilot.use(law)
@@ -187,7 +202,7 @@ class Settings:
         """Move the elevator's stops; at the ends of the travel the travel alone counts."""
         low, high = after["ELEV_LOW_DEG"], after["ELEV_HIGH_DEG"]
         if not low <= self._neutral_deg <= high:
-            return f"stops: expected them around neutral {self._neutral_deg:.4g} deg"
+            return f"ELEV_LOW_DEG, _HIGH_DEG: neutral is {self._neutral_deg:.4g} deg"
         stop_low = -math.inf if low == self.parameters.defaults["ELEV_LOW_DEG"] else math.radians(low)
         stop_high = math.inf if high == self.parameters.defaults["ELEV_HIGH_DEG"] else math.radians(high)
         self._pilot.set_travel(replace(self._pilot.travel, stop_low=stop_low, stop_high=stop_high))

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 
-from autopilot.link.clock import NS_PER_S
+from autopilot.link.clock import NS_PER_S, NS_PER_US
 from autopilot.link.groundmessages import AttitudeTarget, CurrentMode, ExtendedSysState, GlobalPositionInt, SysStatus
 from autopilot.link.messages import AoaSsa, Attitude, NamedValueFloat, NamedValueInt, ServoOutputRaw, VfrHud
 from autopilot.link.wire import message_id
@@ -49,11 +49,13 @@ GROUPS: Mapping[int, tuple[type, ...]] = {
 
 MIN_INTERVAL_NS = NS_PER_S // 100
 """The fastest stream: 100 Hz. The elevator has the link's time first."""
+MAX_INTERVAL_NS = ((1 << 31) - 1) * NS_PER_US
+"""The slowest: once in 36 minutes, the longest interval that MESSAGE_INTERVAL can tell."""
 
 
 def interval_of(rate_hz: float) -> int | None:
-    """Return the interval of a rate, ns; None for rate 0, which is off."""
-    return None if rate_hz <= 0.0 else max(MIN_INTERVAL_NS, round(NS_PER_S / rate_hz))
+    """Return the interval of a rate, ns, within the limits; None for rate 0, which is off."""
+    return None if rate_hz <= 0.0 else round(min(max(MIN_INTERVAL_NS, NS_PER_S / rate_hz), MAX_INTERVAL_NS))
 
 
 class Streams:

@@ -16,7 +16,7 @@ from autopilot.config import Home
 from autopilot.ground import commands
 from autopilot.ground.parameters import Parameters
 from autopilot.ground.position import Position
-from autopilot.ground.services import ANSWERS
+from autopilot.ground.services import ANSWERS, autopilot_version
 from autopilot.ground.streams import GROUPS, RATE_PARAMETERS, Streams, interval_of
 from autopilot.link.clock import NS_PER_MS, NS_PER_S, NS_PER_US, following
 from autopilot.link.groundmessages import (
@@ -146,6 +146,7 @@ class Vehicle:
         self.position = Position(home)
         self.refused = 0
         self.elsewhere = 0
+        autopilot_version()  # looked up now, not when it is asked for in flight
         self._storage = storage
         self._values = parameters.values
         rates = {message: self._values[name] for name, message in RATE_PARAMETERS.items()}
@@ -203,11 +204,11 @@ class Vehicle:
             case ParamRequestList() | ParamRequestRead() | ParamSet():
                 self._parameter(station, source, message, now_ns)
             case SetAttitudeTarget():
-                self.commander.attitude_target(message, source, now_ns)
+                self.commander.attitude_target(message, (station.port, *source), now_ns)
             case ManualControl():
-                self.commander.manual_control(message, now_ns)
+                self.commander.manual_control(message, (station.port, *source), now_ns)
             case RcChannelsOverride():
-                self.commander.rc_override(message, now_ns)
+                self.commander.rc_override(message, (station.port, *source), now_ns)
             case RequestDataStream():
                 _request_data_stream(station.streams, message, now_ns)
             case SetMode():

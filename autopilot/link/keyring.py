@@ -7,6 +7,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import click
+
 from autopilot.link.clock import Clock
 from autopilot.link.keyfile import TimestampStore, read_key, wall_clock_start
 from autopilot.link.signing import Signing
@@ -37,6 +39,7 @@ class Keyring:
         self._program = program
         self._clock = clock
         self._stores: dict[Path, tuple[bytes, TimestampStore]] = {}
+        self._failed: set[Path] = set()
 
     def seal(
         self, port: str, key_file: Path, link_id: int, *, peer_link: int | None = None, accept_unsigned: bool = False
@@ -59,9 +62,13 @@ class Keyring:
         return signing
 
     def pass_(self, now_ns: int) -> None:
-        """Write what is due; called on every pass of the driver."""
-        for _, store in self._stores.values():
+        """Write what is due; called on every pass of the driver. A disk that fails is told of once."""
+        for path, (_, store) in self._stores.items():
             store.pass_(now_ns)
+            if store.failure and path not in self._failed:
+                self._failed.add(path)
+                why = f"{store.path}: not written ({store.failure}): old frames may pass after a restart"
+                click.echo(f"{self._program}: warning: {why}", err=True)
 
     def close(self) -> None:
         """Write the exact timestamps; nothing is signed or accepted afterwards."""

@@ -185,6 +185,8 @@ def run_node(
     for signum in (signal.SIGINT, signal.SIGTERM):
         signal.signal(signum, stop)
     with ExitStack() as stack:
+        if keyring is not None:
+            stack.callback(keyring.close)
         ports: list[UdpPort] = []
         for open_port in openers:
             ports.append(open_port())
@@ -205,10 +207,7 @@ def run_node(
             click.echo(banner, err=True)
         gc.collect()
         gc.freeze()  # what is loaded now stays: no later collection has to look at it
-        on_pass = None
-        if keyring is not None:
-            stack.callback(keyring.close)
-            on_pass = keyring.pass_
+        on_pass = keyring.pass_ if keyring is not None else None
         driver = stack.enter_context(
             closing(UdpDriver(node, ports, options.clock, sink, tap=tap, control=control, on_pass=on_pass))
         )
@@ -220,6 +219,8 @@ def run_node(
 
 def _port_counters(name: str, ports: Sequence[UdpPort], records_lost: int, t_ns: int) -> Record:
     """Return the event that says what the ports refused and could not send, and what was not recorded."""
-    data = {port.name: {"strangers": port.strangers, "unsent": port.unsent} for port in ports}
+    data = {
+        port.name: {"strangers": port.strangers, "unsent": port.unsent, "overflowed": port.overflowed} for port in ports
+    }
     body = {"kind": "ports", "node": name, "text": f"{name} ports", "data": {**data, "records_lost": records_lost}}
     return Record("events", t_ns, body)

@@ -266,7 +266,9 @@ class Signing:
     def would_accept(self, frame: bytes) -> bool:
         """Return whether a frame is genuine and new, if need be after the next write; remember and count nothing."""
         signed = len(frame) > SIGNATURE_BLOCK_BYTES and frame[0] == _MARKER_V2 and bool(frame[2] & _SIGNED)
-        if signed and not compare_digest(self._signature(frame[:-_SIGNATURE_BYTES]), frame[-_SIGNATURE_BYTES:]):
+        if not signed:
+            return self._accept_unsigned
+        if not compare_digest(self._signature(frame[:-_SIGNATURE_BYTES]), frame[-_SIGNATURE_BYTES:]):
             return False  # before anything is copied: strangers are cheap
         return deepcopy(self).check(frame) in (Verdict.ACCEPTED, Verdict.UNRESERVED)
 
@@ -330,6 +332,8 @@ class Signing:
             if timestamp <= stream.floor or (position == 0 and len(times) == self._depth):
                 return Verdict.TOO_OLD
         if is_newest:
+            if stream.lead is not None and timestamp < self._clock + stream.lead - NEW_STREAM_SPAN:
+                return Verdict.TOO_OLD  # kept back on the way, since its sender has long been later
             stream.lead = timestamp - self._clock
         if self._limit is not None and timestamp > stream.covered:
             self.wants_store = True

@@ -66,11 +66,11 @@ class Scene:
         return self
 
     def forward(self, x: int) -> Scene:
-        self.it.manual_control(ManualControl(1, x, 0, 0, 0, 0), self.now_ns)
+        self.it.manual_control(ManualControl(1, x, 0, 0, 0, 0), GCS, self.now_ns)
         return self
 
     def pulse(self, chan2: int) -> Scene:
-        self.it.rc_override(RcChannelsOverride(1, 1, chan2), self.now_ns)
+        self.it.rc_override(RcChannelsOverride(1, 1, chan2), GCS, self.now_ns)
         return self
 
     @property
@@ -196,11 +196,18 @@ def test_a_sender_without_a_clock_is_never_late_and_equal_stamps_are_not_either(
     assert scene.it.refused == 0
 
 
-def test_each_sender_has_its_own_clock():
-    scene = Scene().setpoint(pitched(0.1), stamp=9_000).setpoint(pitched(0.2), stamp=8_500, sender=(254, 190))
-    assert (scene.pitch, scene.it.refused) == (pytest.approx(0.2), 0)
+def test_each_sender_has_its_own_clock_and_the_first_has_the_stick_until_it_falls_silent():
+    scene = Scene().setpoint(pitched(0.1), stamp=9_000)
+    for _ in range(3):
+        scene.setpoint(pitched(0.2), stamp=8_500, sender=(254, 190))
+    assert (scene.pitch, scene.it.refused) == (pytest.approx(0.1), 3)
+    assert sum("another station" in text for text in scene.texts) == 1
+    scene.now_ns = scene.it.next_deadline_ns()
+    scene.it.tick(scene.now_ns)
+    scene.setpoint(pitched(0.2), stamp=8_500, sender=(254, 190))
+    assert (scene.pitch, scene.it.refused) == (pytest.approx(0.2), 3)
     scene.setpoint(pitched(0.3), stamp=8_400, sender=(254, 190))
-    assert (scene.pitch, scene.it.refused) == (pytest.approx(0.2), 1)
+    assert (scene.pitch, scene.it.refused) == (pytest.approx(0.2), 4)
 
 
 def test_however_many_senders_there_are_the_stamps_of_few_are_kept():
