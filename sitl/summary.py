@@ -263,7 +263,7 @@ def summary_table(summary: Mapping[str, Any], verdicts: Sequence[Verdict]) -> Gr
         wide = summary["conservative"]
         grid.add_row("conservative gains", f"{wide['gains']} (certificate: {wide['certificate']})")
     rms, peak, final = (np.degrees(summary[f"{m}_error_rad"]) for m in ("rms", "max", "final"))
-    released_s = summary["released_s"]
+    released_s = summary.get("released_s", 0.0)
     released = f"; without {released_s:.3g} s disarmed or by hand" if released_s else ""
     grid.add_row("tracking error", f"rms {rms:.3g}°, largest {peak:.3g}°, last second {final:.3g}°{released}")
     grid.add_row("true delay", _histogram_text(delay["true_histogram"]))

@@ -304,7 +304,8 @@ def test_a_stick_that_falls_silent_is_in_the_middle(mode):
     scene.it.tick(scene.now_ns + REFERENCE_NS)
     assert scene.it.stick == 0.0
     assert mode is FlightMode.MANUAL or scene.pitch == 0.0
-    assert scene.texts == [f"{mode.name}: silence, holding trim"]
+    what = "elevator neutral" if mode is FlightMode.MANUAL else "holding trim"
+    assert scene.texts == [f"{mode.name}: silence, {what}"]
 
 
 def test_what_is_refused_does_not_keep_a_stream_alive():

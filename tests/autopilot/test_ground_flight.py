@@ -244,7 +244,7 @@ def test_in_manual_the_stick_pulled_back_pitches_the_aircraft_up_and_is_the_elev
 def test_a_stick_that_falls_silent_leaves_the_elevator_neutral_after_the_time_out_and_that_is_said():
     flight = GroundFlight(6, [(1.5, put("REF_TIME_S", 0.5)), (2.0, mode(MANUAL))], every(stick(-100), 2.5, 3.0))
     last_s = 2.5 + 9 / 20
-    assert flight.told("MANUAL: silence, holding trim") == [pytest.approx(last_s + 0.5, abs=2 * MS / S)]
+    assert flight.told("MANUAL: silence, elevator neutral") == [pytest.approx(last_s + 0.5, abs=2 * MS / S)]
     assert set(u_of(flight.after(last_s + 0.53))) == {0.0}
     assert 0.0 not in set(u_of(flight.after(2.53, last_s + 0.5)))
 

@@ -74,7 +74,7 @@ def refused(b: Cockpit, name: str, value: float, reason: str) -> None:
 def test_other_gains_that_are_proved_over_the_present_window_are_taken_in_flight_without_a_jump():
     b = flying()
     assert b.put("GAINS", 1.0) == 1.0
-    assert b.statements()[-1] == "certificate verified: gains hirm-d6"
+    assert b.statements()[-2:] == ["certificate verified: gains hirm-d6", "flown at delay 1..4 of 1..6"]
     before = b.u
     b.fly(40)
     assert abs(b.commands[20]["u"][0] - before) < NO_JUMP
@@ -86,7 +86,7 @@ def test_other_gains_that_are_proved_over_the_present_window_are_taken_in_flight
 @pytest.mark.parametrize(
     ("index", "reason"),
     [
-        (2.0, "hirm-d3: delay 1..3, flown 1..4"),
+        (2.0, "hirm-d3: 1..3; window now 1..4"),
         (3.0, "hirm-paper: armed, and no verified certificate"),
         (4.0, "GAINS 4: expected 0 to 3"),
         (-1.0, "GAINS -1: expected 0 to 3"),
@@ -116,7 +116,7 @@ def test_gains_for_longer_delays_leave_the_window_as_it_was_until_it_is_widened(
 
 def test_gains_for_shorter_delays_are_taken_after_a_narrower_window():
     b = flying()
-    refused(b, "GAINS", 2.0, "hirm-d3: delay 1..3, flown 1..4")
+    refused(b, "GAINS", 2.0, "hirm-d3: 1..3; window now 1..4")
     assert b.put("DELAY_MAX", 3.0) == 3.0
     assert b.put("GAINS", 2.0) == 2.0
     b.fly(10)
@@ -217,8 +217,8 @@ def test_at_the_ends_of_the_travel_the_whole_travel_is_there_again():
 
 def test_stops_stay_around_neutral_and_inside_the_travel():
     b = flying()
-    refused(b, "ELEV_LOW_DEG", 1.0, "stops: expected them around neutral 0 deg")
-    refused(b, "ELEV_HIGH_DEG", -1.0, "stops: expected them around neutral 0 deg")
+    refused(b, "ELEV_LOW_DEG", 1.0, "ELEV_LOW_DEG, _HIGH_DEG: neutral is 0 deg")
+    refused(b, "ELEV_HIGH_DEG", -1.0, "ELEV_LOW_DEG, _HIGH_DEG: neutral is 0 deg")
     refused(b, "ELEV_HIGH_DEG", 26.0, "ELEV_HIGH_DEG 26: expected -25 to 25")
     b.fly(10, 3.0 * WILD)
     assert max(abs(c["u"][0]) for c in b.commands) == TRAVEL
@@ -309,11 +309,12 @@ def test_defaults_come_back_in_the_vehicle_and_the_file_stays(tmp_path):
     assert path.read_bytes() == before
 
 
-def test_without_a_file_reading_brings_back_the_defaults(tmp_path):
+def test_without_a_file_there_is_nothing_to_read_and_nothing_changes(tmp_path):
     b = kept(tmp_path / "none.toml").fly(2)
     b.put("STICK_DEG", 7.5)
-    assert b.result(STORAGE, LOAD) == ACCEPTED
-    assert b.node.commander.stick_rad == math.radians(15.0)
+    assert b.result(STORAGE, LOAD) == FAILED
+    assert b.statements()[-1] == "parameters: none are saved"
+    assert b.node.commander.stick_rad == math.radians(7.5)
 
 
 def broken_file(path: Path) -> None:

@@ -85,6 +85,9 @@ class NoDisk:
 
     parameters: Parameters
 
+    def busy(self, now_ns: int) -> bool:
+        return False
+
     def save(self) -> str | None:
         return "nowhere"
 
