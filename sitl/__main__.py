@@ -19,6 +19,7 @@ from autopilot.link.keyring import CONTROL_LINK, Keyring
 from autopilot.link.process import ADDRESS, ProcessOptions, process_options, run_node
 from autopilot.link.udp import Address, dial, listen
 from autopilot.link.wire import AUTOPILOT, frames_of
+from autopilot.profile import parse_profile
 from gains.command import NEGATIVE, SUCCESS, FiniteRange, print_json, run, version
 from gains.store import load_model
 from gains.table import InputError
@@ -36,7 +37,7 @@ from sitl.summary import summary_table
 __all__ = ["main"]
 
 INTERRUPTED = 130
-KEY_FILE = click.Path(dir_okay=False, path_type=Path)
+FILE = click.Path(dir_okay=False, path_type=Path)
 SEED = click.IntRange(0, MAX_SEED)
 
 
@@ -91,7 +92,7 @@ def _square(text: str) -> SquareDelta:
 @click.option("--gust", "gust_s", type=FiniteRange(0.0), help="The gust of Eq. (52), from this time in s on.")
 @click.option("--uncertainty", help="Delta(k) of Eq. (51) as AMPLITUDE:HALF_PERIOD, for example 0.15:20.")
 @click.option("--no-aoa", is_flag=True, help="Send no AOA_SSA, as many vehicles do not.")
-@click.option("--key", "key_file", type=KEY_FILE, help="Sign the link with the key in this file (README, Security).")
+@click.option("--key", "key_file", type=FILE, help="Sign the link with the key in this file (README, Security).")
 @click.option("--accept-unsigned", is_flag=True, help="With --key: hear frames without signature, too.")
 @process_options
 def plant(
@@ -198,9 +199,12 @@ def relay(
 @click.option("--out", type=click.Path(file_okay=False, path_type=Path), help="Folder for the files.")
 @click.option("--gcs", multiple=True, default=("udpout:127.0.0.1:14550",), show_default=True,
               help='Ground station; may be repeated; "none" for none.')  # fmt: skip
+@click.option("--reference", help="Another programmed reference than the scenario's (README).")
+@click.option("--alternative", "alternatives", multiple=True, help="Gains that a ground station may choose instead.")
+@click.option("--parameters", "parameters_file", type=FILE, help="File of the vehicle's parameters.")
 @click.option("--wait-arm", is_flag=True, help="Leave arming to a ground station; else the vehicle arms itself.")
-@click.option("--key", "key_file", type=KEY_FILE, help="Sign the control link with the key in this file.")
-@click.option("--gcs-key", "gcs_key_file", type=KEY_FILE, help="Sign the ground stations' links with this key.")
+@click.option("--key", "key_file", type=FILE, help="Sign the control link with the key in this file.")
+@click.option("--gcs-key", "gcs_key_file", type=FILE, help="Sign the ground stations' links with this key.")
 @click.option("--port-base", type=click.IntRange(0, 65_000), default=DEFAULT_PORT_BASE, show_default=True,
               help="The plant's port, the relay's is the next; 0 for any free ones.")  # fmt: skip
 @click.option("--json", "as_json", is_flag=True, help="Print the summary as one JSON object.")
@@ -214,6 +218,8 @@ def fly_(
     virtual: bool,
     out: Path | None,
     gcs: tuple[str, ...],
+    alternatives: tuple[str, ...],
+    parameters_file: Path | None,
     wait_arm: bool,
     key_file: Path | None,
     gcs_key_file: Path | None,
@@ -230,16 +236,19 @@ def fly_(
     stations = tuple(address for address in gcs if address != "none")
     for address in stations:
         dial("gcs", ADDRESS.convert(address, None, None)).socket.close()  # refused now rather than by a program
-    if virtual and (wait_arm or key_file or gcs_key_file):
-        raise InputError("--virtual: nobody can arm, and nothing is signed, in virtual time")
+    if virtual and (wait_arm or key_file or gcs_key_file or alternatives or parameters_file):
+        options = "--wait-arm, --key, --gcs-key, --alternative, --parameters"
+        raise InputError(f"--virtual: expected none of {options}: there is no ground station in virtual time")
     for path in filter(None, (key_file, gcs_key_file)):
         read_key(path)  # refused now rather than by a program
     folder = out or _new_folder(f"{scenario.name}-{datetime.now():%Y%m%d-%H%M%S}")
+    ground = ["--wait-arm"] if wait_arm else []
+    ground += [word for name in alternatives for word in ("--alternative", name)]
+    ground += [] if parameters_file is None else ["--parameters", str(parameters_file)]
+    flight = FlightOptions(virtual, folder, stations, port_base, tuple(ground), key_file, gcs_key_file)
     console = Console(stderr=True)
     try:
-        outcome = fly(
-            scenario, FlightOptions(virtual, folder, stations, port_base, wait_arm, key_file, gcs_key_file), console
-        )
+        outcome = fly(scenario, flight, console)
     except FlightFailed as failure:
         click.echo(f"sitl: error: {failure}", err=True)
         return NEGATIVE
@@ -271,6 +280,8 @@ def _changed(
 ) -> Scenario:
     """Return the scenario with what the command line changes; its variants change alike."""
     given = {name: value for name, value in changes.items() if value is not None}
+    if "reference" in given:
+        parse_profile(given["reference"], scenario.gains.model.Ts)  # refused now rather than by a program
     if "duration" in given:
         given["duration_s"] = given.pop("duration")
     if preset is not None:

@@ -51,8 +51,8 @@ class FlightOptions:
         Addresses that get telemetry.
     port_base : int
         The plant listens there and the relay on the next port; 0 for any free ports.
-    wait_arm : bool
-        Leave arming to a ground station.
+    ground_arguments : tuple of str
+        Options of the autopilot that are about ground stations, over UDP.
     key_file, gcs_key_file : Path or None
         Keys of the control link and of the ground stations' links, over UDP.
     """
@@ -61,7 +61,7 @@ class FlightOptions:
     folder: Path | None
     ground_stations: tuple[str, ...] = ()
     port_base: int = DEFAULT_PORT_BASE
-    wait_arm: bool = False
+    ground_arguments: tuple[str, ...] = ()
     key_file: Path | None = None
     gcs_key_file: Path | None = None
 
@@ -248,7 +248,7 @@ def _start_programs(
 
 def _ground_arguments(options: FlightOptions) -> list[str]:
     """Return the options of the autopilot that are none of the scenario."""
-    arguments = ["--wait-arm"] if options.wait_arm else []
+    arguments = list(options.ground_arguments)
     for port, path in (("plant", options.key_file), ("gcs", options.gcs_key_file)):
         arguments += [] if path is None else ["--key", f"{port}={path}"]
     return arguments
