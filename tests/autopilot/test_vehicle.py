@@ -305,7 +305,11 @@ def test_the_banner_is_told_before_the_first_heartbeat_and_once_more_to_a_statio
     scene = Scene(("gcs0", "gcs1"), [StatusText(Severity.WARNING, "no certificate")])
     scene.tick()
     for port in scene.ports:
-        assert [m.get_type() for _, where, m in scene.got if where == port] == ["HOME_POSITION", "STATUSTEXT", "HEARTBEAT"]
+        assert [m.get_type() for _, where, m in scene.got if where == port] == [
+            "HOME_POSITION",
+            "STATUSTEXT",
+            "HEARTBEAT",
+        ]
     assert scene.texts() == ["no certificate"]
     scene.got.clear()
     for _ in range(3):
