@@ -366,7 +366,7 @@ class Pilot:
             self._match_reference(reference, sample, gains, ahead)
         if flown:
             self._law_changed = False
-        return reference.ahead(ahead), self._source.r(sample.j)
+        return reference.ahead(ahead), self._source.r(reference.k)  # k is j, but where j is before the beginning
 
     def _takes_over(self, was: Mode) -> bool:
         """Return whether a law takes over from a hand, from the last command, from neutral, or from another law."""
