@@ -10,6 +10,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
+from autopilot.link.messages import Timesync
 from autopilot.link.signing import (
     DEPTH,
     LAST_TIMESTAMP,
@@ -22,6 +23,7 @@ from autopilot.link.signing import (
     Verdict,
     timestamp_of,
 )
+from autopilot.link.wire import Wire
 
 quick = settings(deadline=None)
 KEY = bytes(range(32))
@@ -589,3 +591,24 @@ def test_frames_pass_while_nothing_can_be_stored():
     ours.tick(7200 * 10**9)
     assert timestamp_in(ours.sign(unsigned_body())) == NOW + 7200 * SECOND
     assert (ours.held_back, ours.overdrawn) == (0, 0)
+
+
+def test_a_frame_that_was_kept_back_for_more_than_a_minute_is_refused_although_no_newer_one_came():
+    end = receiver()
+    end.tick(0)
+    assert end.check(frame(NOW)) is Verdict.ACCEPTED
+    kept_back, in_time = frame(NOW + 1), frame(NOW + 5)
+    end.tick(59 * 10**9)
+    assert end.check(in_time) is Verdict.ACCEPTED
+    end.tick(7200 * 10**9)
+    assert end.check(kept_back) is Verdict.TOO_OLD
+    assert end.check(frame(NOW + 6)) is Verdict.TOO_OLD
+    assert end.check(frame(NOW + 7200 * SECOND)) is Verdict.ACCEPTED
+
+
+@pytest.mark.parametrize("accepting", [False, True])
+def test_a_listener_asks_of_an_unsigned_frame_only_whether_such_are_heard(accepting, monkeypatch):
+    end = receiver(accept_unsigned=accepting)
+    monkeypatch.setattr("autopilot.link.signing.deepcopy", lambda _: pytest.fail("copied for a stranger"))
+    assert end.would_accept(Wire(PLANT, None).encode(Timesync(1, 2))) is accepting
+    assert not end.would_accept(frame(NOW, key=bytes(32)))
