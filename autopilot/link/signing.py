@@ -4,7 +4,8 @@ A signature shows that a holder of the key made a frame, its timestamp that the 
 signature is verified first and alone; only a frame that passes can change anything here, so a forged frame
 costs one hash of at most 280 bytes and leaves no trace but a counter. Each stream (system, component, link id)
 has a window of its own: the ``depth`` newest accepted timestamps are known one by one, and what is older than
-all of them is refused. A frame that up to ``depth - 1`` newer ones overtook is thus taken, exactly once.
+all of them is refused. A frame that up to ``depth - 1`` newer ones overtook is thus taken, exactly once; one that was
+kept back on the way for more than a minute is not.
 
 What must outlive a restart is a :class:`Timestamps`. It is written *ahead*, by ``RESERVE`` of 2 s and every
 second, and what is stored is never overrun: once :meth:`Signing.stored` was called, a frame beyond the stored
@@ -331,9 +332,9 @@ class Signing:
                 return Verdict.REPLAYED
             if timestamp <= stream.floor or (position == 0 and len(times) == self._depth):
                 return Verdict.TOO_OLD
+        if stream.lead is not None and timestamp < self._clock + stream.lead - NEW_STREAM_SPAN:
+            return Verdict.TOO_OLD  # kept back on the way: its sender has long been later
         if is_newest:
-            if stream.lead is not None and timestamp < self._clock + stream.lead - NEW_STREAM_SPAN:
-                return Verdict.TOO_OLD  # kept back on the way, since its sender has long been later
             stream.lead = timestamp - self._clock
         if self._limit is not None and timestamp > stream.covered:
             self.wants_store = True
