@@ -353,13 +353,15 @@ class Pilot:
         reference = self.reference
         if reference is None:
             return (), 0.0
+        target = self._wanted_target()
+        if target is _STILL and target is not self._target:
+            self._aim(target)  # before the samples of a silence are gone through
         reference.advance(sample.j)
         ahead = 0
         if self.config.align:
             unknown, most = self.window[0], self.window[1] + (MAX_AHEAD if flown else 0)
             ahead = min(forecast.d, most) if forecast.d is not None else unknown
         self._ahead = ahead
-        target = self._wanted_target()
         if target is not self._target:
             self._aim(target)
         if flown and self._takes_over(was):
