@@ -1,12 +1,15 @@
 # make fly    fly the SITL pair over a laggy link, over UDP on this machine
 # make test   the test suite (under 10 minutes)
 # make check  what CI runs: format, lint, types, import contract
+# make fuzz   fuzz one decoder: TARGET=autopilot SECONDS=60
 PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 FLIGHT ?= nominal
+TARGET ?= autopilot
+SECONDS ?= 60
 
-.PHONY: setup fly test check check-long bench format clean
+.PHONY: setup fly test check check-long bench fuzz format clean
 
 setup: $(VENV)/ready
 
@@ -36,6 +39,9 @@ check-long: setup
 
 bench: setup
 	$(BIN)/python -m tests.bench
+
+fuzz: setup
+	$(BIN)/python -m tests.fuzz $(TARGET) --seconds $(SECONDS)
 
 format: setup
 	$(BIN)/ruff format

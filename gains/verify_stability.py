@@ -18,10 +18,13 @@ from gains.definite import EPS, LEAST, MOST, UNDERFLOW, Verification, definite, 
 from gains.model import GainLaw, Matrix, sets_of
 from gains.switched_certificate import Block
 
-__all__ = ["MAX_DEPTH", "MAX_PRODUCTS", "MAX_SETS", "check_blocks", "check_contraction"]
+__all__ = ["MAX_DEPTH", "MAX_OPERATIONS", "MAX_PRODUCTS", "MAX_SETS", "check_blocks", "check_contraction"]
 
 MAX_PRODUCTS = 2_000_000
-"""Products that a tree may grow to in verification."""
+"""Products that the trees of one certificate may grow to in verification."""
+
+MAX_OPERATIONS = 1 << 33
+"""What these may cost, n³ for each product of size n: some fifteen seconds, however large the blocks are."""
 
 MAX_DEPTH = 4000
 """Samples of the longest product of such a tree."""
@@ -31,6 +34,19 @@ MAX_SETS = 4096
 
 _BATCH = 1 << 18  # entries of the products that are grown at once
 _SAFETY = 16  # times n² eps: more than the relative rounding of any norm here
+
+
+class _Allowance:
+    """What the trees of one certificate may still cost: a file must not keep its reader for hours."""
+
+    def __init__(self) -> None:
+        self._products, self._operations = MAX_PRODUCTS, MAX_OPERATIONS
+
+    def take(self, products: int, n: int) -> bool:
+        """Take so many products of size n away, and return whether that was allowed."""
+        self._products -= products
+        self._operations -= products * n**3
+        return self._products >= 0 and self._operations >= 0
 
 
 def check_contraction(law: GainLaw, v: Matrix) -> Verification:
@@ -84,10 +100,10 @@ def check_blocks(F: Matrix, error: Matrix, edges: NDArray[np.intp], blocks: Sequ
     used = np.unique(edges[:, 2])
     if np.any(F[used][:, later]) or np.any(error[used][:, later]):
         return failed("a block depends on a later one")
-    results = []
+    results, allowance = [], _Allowance()
     for block in blocks:
         own = np.ix_(range(len(F)), block.states, block.states)
-        results.append(_block(F[own], error[own], edges, block))
+        results.append(_block(F[own], error[own], edges, block, allowance))
         if not results[-1].passed:
             return results[-1]
     return min(results, key=lambda v: v.margin / v.rounding if v.rounding > 0.0 else math.inf)
@@ -115,13 +131,13 @@ def _unusable(F: Matrix, error: Matrix, edges: NDArray[np.intp], blocks: Sequenc
     return ""
 
 
-def _block(F: Matrix, error: Matrix, edges: NDArray[np.intp], block: Block) -> Verification:
+def _block(F: Matrix, error: Matrix, edges: NDArray[np.intp], block: Block, allowance: _Allowance) -> Verification:
     """Check one block by its own part of F."""
     results = [definite(P, np.zeros_like(P), "a matrix of a block is not positive definite") for P in block.P]
     with np.errstate(over="ignore", invalid="ignore", under="ignore"):
         if all(result.passed for result in results):
             if block.kind == "tree":
-                results.append(_tree(F, error, edges, block.P))
+                results.append(_tree(F, error, edges, block.P, allowance))
             elif block.kind == "paths":
                 results += [_falls(F[k], error[k], block.P[i], block.P[j]) for i, j, k in edges.tolist()]
             else:
@@ -159,7 +175,7 @@ class _Products(NamedTuple):
         return _Products(self.X[which], self.error[which], self.at[which], self.length)
 
 
-def _tree(F: Matrix, error: Matrix, edges: NDArray[np.intp], P: Matrix) -> Verification:
+def _tree(F: Matrix, error: Matrix, edges: NDArray[np.intp], P: Matrix, allowance: _Allowance) -> Verification:
     """Grow the admissible products until each is pruned, depth-first, the modes with equal matrices as one.
 
     With one P a product starts at any node; with a P for each, at each, and its norm is from its node to its last.
@@ -179,15 +195,15 @@ def _tree(F: Matrix, error: Matrix, edges: NDArray[np.intp], P: Matrix) -> Verif
     n = F.shape[1]
     batch = max(1, _BATCH // (len(edges) * n * n))
     stack = [_Products(np.repeat(np.eye(n)[None], len(starts), axis=0), np.zeros(len(starts)), starts, 0)]
-    count, worst = 0, Verification(True, 1.0, 0.0, "")
+    worst = Verification(True, 1.0, 0.0, "")
     while stack:
         top = stack.pop()
         if len(top.X) > batch:
             stack.append(top.part(slice(0, -batch)))
         grown = _grown(steps, top.part(slice(-batch, None)))
-        count += len(grown.X)
+        allowed = allowance.take(len(grown.X), n)
         usable = np.isfinite(grown.X).all() and np.isfinite(grown.error).all()
-        if count > MAX_PRODUCTS or top.length >= MAX_DEPTH or not usable:
+        if not allowed or top.length >= MAX_DEPTH or not usable:
             return failed("the tree of products does not end")
         norm = _norms(grown)
         short = norm + grown.error < 1.0

@@ -14,10 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
 
+from autopilot.link.clock import NS_PER_S
 from autopilot.link.keyfile import read_key
 from autopilot.link.keyring import CONTROL_LINK, Keyring
 from autopilot.link.process import ADDRESS, ProcessOptions, process_options, run_node
-from autopilot.link.udp import Address, dial, listen
+from autopilot.link.udp import Address, dial, listen, true_ns
 from autopilot.link.wire import AUTOPILOT, frames_of
 from autopilot.profile import parse_profile
 from gains.command import NEGATIVE, SUCCESS, FiniteRange, print_json, run, version
@@ -25,12 +26,14 @@ from gains.store import load_model
 from gains.table import InputError
 from gains.witnessfile import read_witness
 from sitl.aircraft.disturbance import HarmonicGust, SquareDelta
-from sitl.fly import DEFAULT_PORT_BASE, FlightOptions, fly
-from sitl.gate import Gate, check_flyable
-from sitl.linkspec import PRESETS, parse_link, parse_spec
+from sitl.faults import AircraftFault, aircraft_faults, check_faults, parse_fault
+from sitl.fly import DEFAULT_PORT_BASE, FlightOptions, Outcome, fly
+from sitl.link.gate import Gate, check_flyable
+from sitl.link.presets import PRESETS, parse_link
+from sitl.link.relay import RelayNode
+from sitl.link.spec import parse_spec
 from sitl.plant import DEFAULT_SERVO_TIMEOUT, PlantConfig, PlantNode
 from sitl.processes import FlightFailed
-from sitl.relay import RelayNode
 from sitl.scenario import MAX_SEED, Scenario, load_scenario, stored_scenarios
 from sitl.summary import summary_table
 
@@ -70,6 +73,16 @@ def _square(text: str) -> SquareDelta:
     return delta
 
 
+def _plant_faults(texts: Sequence[str], states: Sequence[str]) -> tuple[AircraftFault, ...]:
+    """Return the faults that a plant does itself."""
+    faults = [parse_fault(text) for text in texts]
+    check_faults(faults, states)
+    for text, fault in zip(texts, faults, strict=True):
+        if not isinstance(fault, AircraftFault):
+            raise InputError(f'--fault "{text}": expected sensor:... or elevator:...; "sitl fly --fault" takes all')
+    return aircraft_faults(faults)
+
+
 @cli.command()
 @click.option("--plant", "plant_name", default="hirm", show_default=True, help="Stored model, or a model file.")
 @click.option("--listen", "address", type=ADDRESS, default="127.0.0.1:14600", show_default=True)
@@ -92,6 +105,8 @@ def _square(text: str) -> SquareDelta:
 @click.option("--gust", "gust_s", type=FiniteRange(0.0), help="The gust of Eq. (52), from this time in s on.")
 @click.option("--uncertainty", help="Delta(k) of Eq. (51) as AMPLITUDE:HALF_PERIOD, for example 0.15:20.")
 @click.option("--no-aoa", is_flag=True, help="Send no AOA_SSA, as many vehicles do not.")
+@click.option("--fault", "fault_texts", multiple=True, help="Failing sensor or elevator; may be repeated (README).")
+@click.option("--seed", type=SEED, default=1, show_default=True, help="Of a failing sensor's noise.")
 @click.option("--key", "key_file", type=FILE, help="Sign the link with the key in this file (README, Security).")
 @click.option("--accept-unsigned", is_flag=True, help="With --key: hear frames without signature, too.")
 @process_options
@@ -105,6 +120,8 @@ def plant(
     gust_s: float | None,
     uncertainty: str | None,
     no_aoa: bool,
+    fault_texts: tuple[str, ...],
+    seed: int,
     key_file: Path | None,
     accept_unsigned: bool,
     **process: Any,
@@ -126,6 +143,8 @@ def plant(
         latch,
         servo_timeout or None,
         not no_aoa,
+        _plant_faults(fault_texts, model.states),
+        seed,
     )
     options = ProcessOptions(**process)
     keyring, seal = Keyring("plant", options.clock), None
@@ -186,6 +205,26 @@ def relay(
     run_node("relay", node, openers, ProcessOptions(**process), metadata, tap=False, control=len(openers))
 
 
+def _in_a_folder(_context: click.Context, parameter: click.Parameter, path: Path | None) -> Path | None:
+    """Refuse now, rather than after the flight, a file in a folder that is not there."""
+    if path is not None and not path.parent.is_dir():
+        raise InputError(f"--{parameter.name} {path}: expected a file in a folder that is there")
+    return path
+
+
+def _report(path: Path | None, name: str, start_ns: int, came_to: Outcome | str) -> None:
+    """Write the JUnit report that was asked for."""
+    if path is None:
+        return
+    from sitl.junit import write_junit  # the programs that fly have no use for its library
+
+    seconds = (true_ns() - start_ns) / NS_PER_S
+    if isinstance(came_to, str):
+        write_junit(path, name, (), {}, seconds, error=came_to)
+    else:
+        write_junit(path, name, came_to.verdicts, came_to.summary, seconds)
+
+
 @cli.command("fly")
 @click.argument("scenario_name", metavar="[SCENARIO]", default="nominal")
 @click.option("--plant", "plant_name", help="Another plant than the scenario's.")
@@ -205,9 +244,11 @@ def relay(
 @click.option("--wait-arm", is_flag=True, help="Leave arming to a ground station; else the vehicle arms itself.")
 @click.option("--key", "key_file", type=FILE, help="Sign the control link with the key in this file.")
 @click.option("--gcs-key", "gcs_key_file", type=FILE, help="Sign the ground stations' links with this key.")
+@click.option("--fault", "faults", multiple=True, help="A fault more, as in kill:autopilot@5s+0.5s; may be repeated.")
 @click.option("--port-base", type=click.IntRange(0, 65_000), default=DEFAULT_PORT_BASE, show_default=True,
               help="The plant's port, the relay's is the next; 0 for any free ones.")  # fmt: skip
 @click.option("--json", "as_json", is_flag=True, help="Print the summary as one JSON object.")
+@click.option("--junit", type=FILE, callback=_in_a_folder, help="Write the checks as a JUnit report, too.")
 def fly_(
     scenario_name: str,
     plant_name: str | None,
@@ -225,6 +266,7 @@ def fly_(
     gcs_key_file: Path | None,
     port_base: int,
     as_json: bool,
+    junit: Path | None,
     **changes: Any,
 ) -> int:
     """Fly a SCENARIO (nominal by default) and judge it: exit 0 when every check passes.
@@ -247,11 +289,14 @@ def fly_(
     ground += [] if parameters_file is None else ["--parameters", str(parameters_file)]
     flight = FlightOptions(virtual, folder, stations, port_base, tuple(ground), key_file, gcs_key_file)
     console = Console(stderr=True)
+    start_ns = true_ns()
     try:
         outcome = fly(scenario, flight, console)
     except FlightFailed as failure:
         click.echo(f"sitl: error: {failure}", err=True)
+        _report(junit, scenario.name, start_ns, str(failure))
         return NEGATIVE
+    _report(junit, scenario.name, start_ns, outcome)
     if as_json:
         print_json(outcome.summary)
     else:
@@ -279,6 +324,7 @@ def _changed(
     scenario: Scenario, preset: str | None, up: str | None, down: str | None, changes: dict[str, Any]
 ) -> Scenario:
     """Return the scenario with what the command line changes; its variants change alike."""
+    faults = tuple(parse_fault(text) for text in changes.pop("faults", ()))
     given = {name: value for name, value in changes.items() if value is not None}
     if "reference" in given:
         parse_profile(given["reference"], scenario.gains.model.Ts)  # refused now rather than by a program
@@ -287,8 +333,12 @@ def _changed(
     if preset is not None:
         given["up"], given["down"] = parse_link(preset, None, None)
     given |= {way: parse_spec(text) for way, text in (("up", up), ("down", down)) if text is not None}
-    variants = {name: replace(variant, **given) for name, variant in scenario.variants.items()}
-    return replace(scenario, **given, variants=variants)
+
+    def changed(one: Scenario) -> Scenario:
+        return replace(one, **given).with_faults((*one.faults, *faults))
+
+    variants = {name: changed(variant) for name, variant in scenario.variants.items()}
+    return replace(changed(scenario), variants=variants)
 
 
 @cli.command()

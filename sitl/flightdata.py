@@ -1,7 +1,8 @@
 """A recorded flight as arrays: the plant's truth, the commands, the link, and the error of Eq. (10).
 
 Time runs in seconds from sample k = 0. A plant that restarts counts its samples from 0 again; its samples
-are then placed where they were in true time, and the reference model starts from zero again.
+are then placed where they were in true time, and the reference model starts from zero again. An autopilot that is
+dead flies nothing: its mode is STANDBY.
 """
 
 from __future__ import annotations
@@ -14,14 +15,18 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from autopilot.failsafe import Mode
 from autopilot.profile import parse_profile
 from gains.model import Matrix, Model
 from gains.table import InputError
-from sitl.impairment import Fate
+from sitl.faults import CorruptGains, Kill, Phase, parse_fault, program_of
+from sitl.link.impairment import Fate
 
 __all__ = ["FlightData", "FlightEvent", "LinkPackets", "ModeInterval"]
 
 LINKS = ("up", "down")
+CLOCK_JUMP_NS = 100_000_000
+"""A relay's clock that jumps by more, from one packet to the next, has been set, or the relay was started again."""
 
 
 class ModeInterval(NamedTuple):
@@ -69,6 +74,8 @@ class FlightData:
         k Ts, s.
     k : ndarray of int, shape (N,)
         Sample numbers as the plant counted them.
+    start : ndarray of int, shape (N,)
+        Where the sample's k = 0 lies on the axis of time, samples; 0 until the plant restarts.
     x : ndarray, shape (N, nx)
         State at sample k, absolute, units of the states.
     u : ndarray, shape (N, nu)
@@ -87,6 +94,8 @@ class FlightData:
         Time of the sample j of each command, s; ascending.
     command_j : ndarray of int, shape (M,)
         Its number.
+    command_sample : ndarray of int, shape (M,)
+        Its place on the axis of time, samples: j and where the plant's k = 0 lies.
     xr : ndarray, shape (M, nr)
         Reference state the command used; nan without.
     forecast, forecast_low, forecast_high : ndarray, shape (M,)
@@ -104,6 +113,7 @@ class FlightData:
     metadata: Mapping[str, str]
     time_s: Matrix
     k: NDArray[np.int64]
+    start: NDArray[np.int64]
     x: Matrix
     u: Matrix
     w: Matrix
@@ -116,6 +126,7 @@ class FlightData:
     engaged: NDArray[np.bool_]
     command_s: Matrix
     command_j: NDArray[np.int64]
+    command_sample: NDArray[np.int64]
     xr: Matrix
     forecast: Matrix
     forecast_low: Matrix
@@ -150,16 +161,18 @@ class FlightData:
         time_s = np.asarray(samples * model.Ts, dtype=np.float64)
         x, u = _rows(truth, "x", model.nx), _rows(truth, "u", model.nu)
         deviation = (x - model.trim.x) @ model.C.T + (u - model.trim.u) @ model.D.T
-        yr = _reference_outputs(model, samples, found.starts, _reference_inputs(model, found, metadata or {}))
+        placed = found.placed_commands()
+        places, commands = sorted(placed), [placed[place] for place in sorted(placed)]
+        r = _reference_inputs(model, found.starts, placed, metadata or {})
+        yr = _reference_outputs(model, samples, found.starts, r)
         trim = model.C @ model.trim.x + model.D @ model.trim.u
 
-        places = sorted(found.commands)
-        commands = [found.commands[place] for place in places]
         return cls(
             model=model,
             metadata=dict(metadata or {}),
             time_s=time_s,
             k=_integers(truth, "k"),
+            start=samples - _integers(truth, "k"),
             x=x,
             u=u,
             w=_rows(truth, "w", len(truth[0]["w"])),
@@ -172,6 +185,7 @@ class FlightData:
             engaged=_engaged(samples, places, commands),
             command_s=np.array(places, dtype=np.float64) * model.Ts,
             command_j=_integers(commands, "j"),
+            command_sample=np.array(places, dtype=np.int64),
             xr=_rows(commands, "xr", model.nr),
             forecast=_numbers(commands, "d"),
             forecast_low=_numbers(commands, "d_low"),
@@ -206,7 +220,8 @@ class _Collected:
     starts: list[int] = field(default_factory=lambda: [0])
     """Where the plant's k = 0 lies: more than one entry after a restart."""
     truth: list[tuple[int, Mapping[str, Any]]] = field(default_factory=list)
-    commands: dict[int, Mapping[str, Any]] = field(default_factory=dict)
+    truth_ns: list[int] = field(default_factory=list)
+    commands: list[tuple[int, Mapping[str, Any]]] = field(default_factory=list)
     modes: list[tuple[int, str]] = field(default_factory=list)
     events: list[tuple[int, Mapping[str, Any]]] = field(default_factory=list)
     links: dict[str, list[tuple[int, Mapping[str, Any]]]] = field(default_factory=lambda: {way: [] for way in LINKS})
@@ -217,7 +232,7 @@ class _Collected:
             case "plant/truth":
                 self._add_truth(log_time_ns, body)
             case "autopilot/command":
-                self.commands[self.starts[-1] + body["j"]] = body
+                self.commands.append((log_time_ns, body))
                 self.modes.append((log_time_ns, body["mode"]))
             case "link/up" | "link/down":
                 if body["fate"] != Fate.GATED:
@@ -226,6 +241,8 @@ class _Collected:
                 self.events.append((log_time_ns, body))
                 if body["kind"] == "failsafe":
                     self.modes.append((log_time_ns, body["data"]["to"]))
+                elif body["kind"] == "fault" and _kills_autopilot(body["data"]):
+                    self.modes.append((log_time_ns, Mode.STANDBY.value))
 
     def _add_truth(self, log_time_ns: int, body: Mapping[str, Any]) -> None:
         k = body["k"]
@@ -237,6 +254,27 @@ class _Collected:
             self.starts.append(max(flown - k, self.truth[-1][0] + 1))
             sample = self.starts[-1] + k
         self.truth.append((sample, body))
+        self.truth_ns.append(log_time_ns)
+
+    def placed_commands(self) -> dict[int, Mapping[str, Any]]:
+        """Return the commands by the sample that each was computed from, on the one axis.
+
+        An autopilot may notice late that the plant has restarted. A number that the plant had not reached since is
+        one of an earlier start, or of none: such a command is left out.
+        """
+        placed = ((self._place(log_time_ns, body["j"]), body) for log_time_ns, body in self.commands)
+        return {place: body for place, body in placed if place is not None}
+
+    def _place(self, log_time_ns: int, j: int) -> int | None:
+        if len(self.starts) == 1:
+            return self.starts[0] + j
+        flown = bisect_right(self.truth_ns, log_time_ns)
+        newest = self.truth[flown - 1][0] if flown else -1
+        for start in reversed(self.starts):
+            if start + j <= newest:
+                return start + j
+            newest = min(newest, start - 1)
+        return None
 
     def time_s(self, log_time_ns: int) -> float:
         """Return a log time as seconds from sample 0."""
@@ -259,10 +297,29 @@ class _Collected:
         arrived = np.array([body["delivered_ns"] is not None for _, body in records], dtype=np.bool_)
         delivered_ns = np.array([body["delivered_ns"] or 0 for _, body in records], dtype=np.int64)
         left_ns = np.where(arrived, delivered_ns, sent_ns)
-        offsets_ns = (log_ns - left_ns)[arrived] if arrived.any() else log_ns - left_ns
-        offset_ns = int(np.median(offsets_ns)) if len(records) else 0
-        entered_s = (sent_ns + offset_ns - (self.zero_ns or 0)) / 1e9
+        entered_s = (sent_ns + _offsets_ns(log_ns - left_ns, arrived) - (self.zero_ns or 0)) / 1e9
         return LinkPackets(entered_s, np.where(arrived, (left_ns - sent_ns) / 1e9, np.nan))
+
+
+def _kills_autopilot(data: Mapping[str, Any]) -> bool:
+    """Return whether an event tells that a fault has killed the autopilot."""
+    if data["phase"] != Phase.BEGIN:
+        return False
+    fault = parse_fault(data["fault"])
+    return isinstance(fault, Kill | CorruptGains) and program_of(fault) == "autopilot"
+
+
+def _offsets_ns(seen_ns: NDArray[np.int64], arrived: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Return by how much the relay's clock is behind the log's at each packet, from what is seen of it there.
+
+    The median over all packets between two jumps of the clock, of those that arrived if any did.
+    """
+    trusted = np.flatnonzero(arrived) if arrived.any() else np.arange(len(seen_ns))
+    if not trusted.size:
+        return seen_ns
+    jumps = np.flatnonzero(np.abs(np.diff(seen_ns[trusted])) > CLOCK_JUMP_NS) + 1
+    medians = [int(np.median(part)) for part in np.split(seen_ns[trusted], jumps)]
+    return np.array(medians, dtype=np.int64)[np.searchsorted(trusted[jumps], np.arange(len(seen_ns)), side="right")]
 
 
 def _engaged(samples: NDArray[np.int64], places: list[int], commands: list[Mapping[str, Any]]) -> NDArray[np.bool_]:
@@ -271,26 +328,34 @@ def _engaged(samples: NDArray[np.int64], places: list[int], commands: list[Mappi
     return said[np.searchsorted(np.array(places, dtype=np.int64), samples, side="right")]
 
 
-def _reference_inputs(model: Model, found: _Collected, metadata: Mapping[str, str]) -> Callable[[int], Matrix]:
+Commands = Mapping[int, Mapping[str, Any]]
+"""By the sample that each was computed from."""
+
+
+def _reference_inputs(
+    model: Model, starts: list[int], commands: Commands, metadata: Mapping[str, str]
+) -> Callable[[int], Matrix]:
     """Return r as a function of the sample: the programmed reference if that was flown, else what commands recorded.
 
     A sample whose command is missing does not say what r was; the last one known then stands in.
     """
-    if (programmed := _programmed_inputs(model, found, metadata)) is not None:
+    if (programmed := _programmed_inputs(model, starts, commands, metadata)) is not None:
         return programmed
     width = 0 if model.reference is None else model.reference.Br.shape[1]
-    known = {place: body["r"] for place, body in found.commands.items() if body["r"] is not None}
+    known = {place: body["r"] for place, body in commands.items() if body["r"] is not None}
     places = sorted(known)
 
     def recorded(sample: int) -> Matrix:
-        i, start = bisect_right(places, sample), max(s for s in found.starts if s <= sample)
+        i, start = bisect_right(places, sample), max(s for s in starts if s <= sample)
         known_since_start = i > 0 and places[i - 1] >= start
         return np.array(known[places[i - 1]], dtype=np.float64) if known_since_start else np.zeros(width)
 
     return recorded
 
 
-def _programmed_inputs(model: Model, found: _Collected, metadata: Mapping[str, str]) -> Callable[[int], Matrix] | None:
+def _programmed_inputs(
+    model: Model, starts: list[int], commands: Commands, metadata: Mapping[str, str]
+) -> Callable[[int], Matrix] | None:
     """Return the recording's programmed reference; None where a command was for another one."""
     try:
         profile = parse_profile(metadata["reference"], model.Ts)
@@ -298,9 +363,9 @@ def _programmed_inputs(model: Model, found: _Collected, metadata: Mapping[str, s
         return None
 
     def programmed(sample: int) -> Matrix:
-        return np.array([profile.r(sample - max(s for s in found.starts if s <= sample))])
+        return np.array([profile.r(sample - max(s for s in starts if s <= sample))])
 
-    flown = all(body["r"] is None or body["r"] == programmed(place).tolist() for place, body in found.commands.items())
+    flown = all(body["r"] is None or body["r"] == programmed(place).tolist() for place, body in commands.items())
     return programmed if flown else None
 
 

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import re
 import signal
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from time import time_ns  # noqa: TID251  a tlog carries the time of day
 from typing import Any
@@ -19,51 +19,23 @@ from autopilot.link.clock import NS_PER_MS, NS_PER_S, NS_PER_US
 from autopilot.link.node import Record
 from autopilot.link.udp import true_ns
 from gains.command import version
-from gains.table import InputError
+from sitl.faults import DiskFull, Fault
 from sitl.flight import fly_virtual
 from sitl.flightdata import FlightData
+from sitl.injector import Injector, check_feasible
 from sitl.processes import ChildDied, FlightFailed, Supervisor
+from sitl.programs import DEFAULT_PORT_BASE, FlightOptions, start_programs
 from sitl.recorder import FlightRecorder
-from sitl.scenario import Scenario, autopilot_arguments, plant_arguments, relay_arguments
+from sitl.scenario import Scenario
 from sitl.summary import Verdict, judge, summarise
 from sitl.view import FlightView
 
-__all__ = ["FlightOptions", "Outcome", "fly"]
+__all__ = ["DEFAULT_PORT_BASE", "FlightOptions", "Outcome", "fly"]
 
 REFRESH_NS = 100 * NS_PER_MS
 SILENCE_LIMIT_NS = 20 * NS_PER_S
 """A flight whose plant sends no sample for so long is over."""
 NO_SAMPLE = f"no sample within {SILENCE_LIMIT_NS // NS_PER_S} s: does the link pass anything?"
-DEFAULT_PORT_BASE = 14600
-
-
-@dataclass(frozen=True, slots=True)
-class FlightOptions:
-    """How a scenario is flown.
-
-    Attributes
-    ----------
-    virtual : bool
-        In virtual time, else over UDP.
-    folder : Path or None
-        Where the files go; None keeps none.
-    ground_stations : tuple of str
-        Addresses that get telemetry.
-    port_base : int
-        The plant listens there and the relay on the next port; 0 for any free ports.
-    ground_arguments : tuple of str
-        Options of the autopilot that are about ground stations, over UDP.
-    key_file, gcs_key_file : Path or None
-        Keys of the control link and of the ground stations' links, over UDP.
-    """
-
-    virtual: bool
-    folder: Path | None
-    ground_stations: tuple[str, ...] = ()
-    port_base: int = DEFAULT_PORT_BASE
-    ground_arguments: tuple[str, ...] = ()
-    key_file: Path | None = None
-    gcs_key_file: Path | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -168,7 +140,57 @@ def _fly_in_process(
             refreshed_ns = true_ns()
             view.refresh(log_time_ns)
 
-    fly_virtual(scenario, write, ground_stations=len(options.ground_stations), stopping=interrupted)
+    def on_fault(fault: Fault) -> None:
+        if isinstance(fault, DiskFull):
+            recorder.fill_disk()
+
+    stations = len(options.ground_stations)
+    fly_virtual(scenario, write, ground_stations=stations, stopping=interrupted, on_fault=on_fault)
+
+
+@dataclass(slots=True)
+class _Progress:
+    """How far a flight over UDP is, as its samples tell; all times true.
+
+    Attributes
+    ----------
+    samples : int
+        The flight's length.
+    Ts_ns : int
+        The plant's sampling time.
+    timed : bool
+        Whether it ends by true time, as its plant may start again, or not at all; else with its last sample.
+    newest_ns : int or None
+        When the newest sample was taken.
+    zero_ns : int or None
+        When sample k = 0 was.
+    end_ns : int
+        When the flight is over; far ahead where that is not known.
+    """
+
+    samples: int
+    Ts_ns: int
+    timed: bool
+    newest_ns: int | None = None
+    zero_ns: int | None = None
+    end_ns: int = 1 << 63
+
+    def take(self, truth: Mapping[str, Any], at_ns: int) -> None:
+        """Take a record of plant/truth."""
+        k = int(truth["k"])
+        self.newest_ns = at_ns
+        if self.zero_ns is None:
+            self.zero_ns = at_ns - int(truth["late_ns"]) - k * self.Ts_ns
+            if self.timed:  # the last sample is in, whatever drifts
+                self.end_ns = self.zero_ns + self.samples * self.Ts_ns - self.Ts_ns // 2
+        if not self.timed and k + 1 >= self.samples:
+            self.end_ns = at_ns
+
+    def silent(self, since_ns: int, now_ns: int) -> bool:
+        """Whether the plant has sent nothing for too long; in a flight with faults that may have been ordered."""
+        if self.timed and self.zero_ns is not None:
+            return False
+        return now_ns - (self.newest_ns or since_ns) > SILENCE_LIMIT_NS
 
 
 def _fly_in_processes(
@@ -179,17 +201,15 @@ def _fly_in_processes(
     interrupted: Callable[[], bool],
 ) -> None:
     """Fly over UDP: plant, relay and autopilot as processes of their own."""
+    check_feasible(scenario.faults)
     start_ns = true_ns()
-    flown, end_ns = 0, 1 << 63
+    progress = _Progress(scenario.samples, scenario.plant.Ts_ns, bool(scenario.faults))
 
     def write(record: Record, at_ns: int) -> None:
-        nonlocal flown, end_ns
-        if at_ns > end_ns:
+        if at_ns > progress.end_ns:
             return  # flown while the programs were being told to end
         if record.topic == "plant/truth":
-            flown = int(record.body["k"]) + 1
-            if flown == scenario.samples:
-                end_ns = at_ns
+            progress.take(record.body, at_ns)
         log_time_ns = max(0, at_ns - start_ns)
         recorder.write(record, log_time_ns)
         view.take(record, log_time_ns)
@@ -198,16 +218,11 @@ def _fly_in_processes(
         folder = options.folder or Path(stack.enter_context(tempfile.TemporaryDirectory()))
         supervisor = Supervisor(folder, write)
         stack.callback(supervisor.close)
-        _start_programs(scenario, options, supervisor, interrupted)
-        seen, seen_ns = 0, true_ns()
+        programs = start_programs(scenario, options, supervisor, interrupted)
+        command_line = partial(programs.again, folder=folder)
+        injector = Injector(scenario.faults, supervisor, command_line, recorder.fill_disk, write, true_ns)
         try:
-            while flown < scenario.samples and not interrupted():
-                supervisor.poll(REFRESH_NS / 1e9)
-                view.refresh(true_ns() - start_ns)
-                if flown > seen:
-                    seen, seen_ns = flown, true_ns()
-                elif true_ns() - seen_ns > SILENCE_LIMIT_NS:
-                    raise FlightFailed(NO_SAMPLE)
+            _follow(supervisor, injector, progress, lambda: view.refresh(true_ns() - start_ns), interrupted)
         finally:
             killed = supervisor.stop()
             recorder.malformed = supervisor.malformed
@@ -215,43 +230,25 @@ def _fly_in_processes(
             raise ChildDied(killed[0], None, "it did not end when asked to")
 
 
-def _start_programs(
-    scenario: Scenario, options: FlightOptions, supervisor: Supervisor, interrupted: Callable[[], bool]
+def _follow(
+    supervisor: Supervisor,
+    injector: Injector,
+    progress: _Progress,
+    refresh: Callable[[], None],
+    interrupted: Callable[[], bool],
 ) -> None:
-    """Start the programs, each as soon as the address it dials is known; an error of theirs is an input error."""
-    plant_port = options.port_base
-    relay_port = options.port_base + 1 if options.port_base else 0
-    stations = [argument for address in options.ground_stations or ("none",) for argument in ("--gcs", address)]
-    try:
-        key = [] if options.key_file is None else ["--key", str(options.key_file)]
-        listen = ["--listen", f"127.0.0.1:{plant_port}"]
-        supervisor.start("plant", ["sitl", "plant", *listen, *key, *plant_arguments(scenario)])
-        if not plant_port:
-            plant_port = supervisor.wait_ready("plant", interrupted).get("autopilot", ("", 0))[1]
-        if interrupted():
-            return
-        relay = ["--listen", f"127.0.0.1:{relay_port}", "--to", f"127.0.0.1:{plant_port}"]
-        supervisor.start("relay", ["sitl", "relay", *relay, *relay_arguments(scenario)])
-        if not relay_port:
-            relay_port = supervisor.wait_ready("relay", interrupted).get("autopilot", ("", 0))[1]
-        if interrupted():
-            return
-        plant = ["--plant", f"udpout:127.0.0.1:{relay_port}", *_ground_arguments(options)]
-        supervisor.start("autopilot", ["autopilot", *plant, *stations, *autopilot_arguments(scenario)])
-        for name in ("plant", "relay", "autopilot"):
-            supervisor.wait_ready(name, interrupted)
-    except ChildDied as death:
-        if death.code == 2 and death.last_words:
-            raise InputError(re.sub(r"^\w+: error: ", "", death.last_words)) from None
-        raise
-
-
-def _ground_arguments(options: FlightOptions) -> list[str]:
-    """Return the options of the autopilot that are none of the scenario."""
-    arguments = list(options.ground_arguments)
-    for port, path in (("plant", options.key_file), ("gcs", options.gcs_key_file)):
-        arguments += [] if path is None else ["--key", f"{port}={path}"]
-    return arguments
+    """Pass on what comes and do what is due, until the flight is over."""
+    refresh_ns = start_ns = true_ns()
+    while (now_ns := true_ns()) < progress.end_ns and not interrupted():
+        injector.zero_ns = progress.zero_ns
+        injector.act()
+        if now_ns >= refresh_ns:
+            refresh()
+            refresh_ns = now_ns + REFRESH_NS
+        wake_ns = min(refresh_ns, progress.end_ns, injector.next_ns() or refresh_ns)
+        supervisor.poll(max(0, wake_ns - true_ns()) / NS_PER_S)
+        if progress.silent(start_ns, true_ns()):
+            raise FlightFailed(NO_SAMPLE)
 
 
 def _conclude(scenario: Scenario, options: FlightOptions, recorder: FlightRecorder, interrupted: bool) -> Outcome:
@@ -266,22 +263,25 @@ def _conclude(scenario: Scenario, options: FlightOptions, recorder: FlightRecord
     summary["interrupted"] = interrupted
     if not interrupted:
         summary["variants"] = {name: _fly_beside(variant) for name, variant in scenario.variants.items()}
-    summary["problems"] = recorder.problems
-    files = dict(recorder.files)
-    if options.folder is not None:
-        files["plot"] = options.folder / "flight.png"
+    folder = options.folder
+    files = recorder.files
+    if folder is not None:
         from sitl.plot import plot_flight  # slow to import, and the programs that fly have no use for it
 
-        plot_flight(files["plot"], flight)
-        files["summary"] = options.folder / "summary.json"
+        recorder.save("plot", folder / "flight.png", lambda path: plot_flight(path, flight))
+        files = {**recorder.files, "summary": folder / "summary.json"}
+    summary["problems"] = recorder.problems
     summary["files"] = {name: str(path) for name, path in files.items()}
     verdicts = judge(() if interrupted else scenario.checks, summary)
     summary["checks"] = [
         {"name": v.check.name, "metric": v.check.metric, "value": v.value, "passed": v.passed} for v in verdicts
     ]
     summary["passed"] = all(v.passed for v in verdicts)
-    if options.folder is not None:
-        files["summary"].write_bytes(orjson.dumps(summary, option=orjson.OPT_INDENT_2) + b"\n")
+    if folder is not None:
+        content = orjson.dumps(summary, option=orjson.OPT_INDENT_2 | orjson.OPT_APPEND_NEWLINE)
+        recorder.save("summary", files["summary"], lambda path: path.write_bytes(content))
+        summary["problems"] = recorder.problems
+        summary["files"] = {name: str(path) for name, path in recorder.files.items()}
     return Outcome(summary, verdicts, interrupted)
 
 

@@ -1,4 +1,4 @@
-"""The aircraft behind a Node: integrate, sense, latch, report d(k).
+"""The aircraft behind a Node: integrate, sense, latch, report d(k); sensors and elevator may fail.
 
 The clockwork. Sample k = 0 is the first instant of the grid i Ts (plant's clock) after the first heartbeat
 of the autopilot; until then the state is held. At sample k the plant latches the command that holds over
@@ -39,7 +39,9 @@ from autopilot.link.wire import (
 )
 from gains.model import Model
 from sitl.aircraft.disturbance import HarmonicGust, SquareDelta
-from sitl.aircraft.linear import LinearAircraft, move_actuator
+from sitl.aircraft.faulty import FaultyElevator, FaultySensors
+from sitl.aircraft.linear import LinearAircraft
+from sitl.faults import AircraftFault
 
 __all__ = ["PlantConfig", "PlantNode", "Refusal"]
 
@@ -87,6 +89,10 @@ class PlantConfig:
         Samples without a new command after which the elevator goes to neutral; None for never.
     aoa : bool
         Whether it sends AOA_SSA; many vehicles do not.
+    faults : tuple of AircraftFault
+        What its sensors and its elevator do wrong, times from sample k = 0.
+    seed : int
+        Of the sensors' noise.
     """
 
     model: Model
@@ -96,6 +102,8 @@ class PlantConfig:
     latch: Literal["newest", "last"] = "newest"
     servo_timeout: int | None = DEFAULT_SERVO_TIMEOUT
     aoa: bool = True
+    faults: tuple[AircraftFault, ...] = ()
+    seed: int = 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -158,6 +166,8 @@ class PlantNode:
         self.refusals: Counter[Refusal] = Counter()
         self._gust = replace(config.gust) if config.gust is not None else None
         self._sensors = sensors_of(config.model)
+        self._faulty_sensors = FaultySensors(config.model, config.faults, config.seed)
+        self._elevator = FaultyElevator(config.model, config.faults)
         self._flight: _Flight | None = None
         self._next_heartbeat_ns: int | None = None
         self._out: list[Datagram] = []
@@ -261,7 +271,7 @@ class PlantNode:
         else:
             flight.pending.append(_Command(now_ns, j, u))
 
-    def _update_latch(self, flight: _Flight, t_ns: int) -> None:
+    def _update_latch(self, flight: _Flight, t_ns: int, now_ns: int) -> None:
         """Latch the command for [k, k+1) out of those that came before or at the sample."""
         latch = flight.latch
         came = [c for c in flight.pending if c.arrived_ns <= t_ns]
@@ -275,17 +285,17 @@ class PlantNode:
         timed_out = latch.j is not None and timeout is not None and flight.k - latch.since_k >= timeout
         if timed_out != latch.timed_out:
             text = f"no command for {timeout} samples: elevator to neutral" if timed_out else "commands are back"
-            self._event("servo_timeout", text, t_ns, {"active": timed_out})
+            self._event("servo_timeout", text, now_ns, {"active": timed_out})
         latch.timed_out = timed_out
 
     # Samples
 
     def _sample(self, flight: _Flight, t_ns: int, now_ns: int) -> None:
         """Latch, sense and send, integrate: one sample."""
-        self._update_latch(flight, t_ns)
+        self._update_latch(flight, t_ns, now_ns)
         latch, k = flight.latch, flight.k
         target = self.travel.neutral if latch.timed_out else latch.u
-        flight.position = move_actuator(self.model, flight.position, np.array([target]))
+        flight.position = self._elevator.move(k, flight.position, np.array([target]))
         w = self._gust.w(k) if self._gust is not None else np.zeros(self.model.nw)
         delta = self.config.delta.delta(k) if self.config.delta is not None else 0.0
         d = None if latch.j is None else k - latch.j
@@ -303,16 +313,16 @@ class PlantNode:
         }
         self._records.append(Record("plant/truth", now_ns, body))
         self._sense(flight, t_ns, d)
-        self._integrate(flight, w, delta, t_ns)
+        self._integrate(flight, w, delta, now_ns)
         flight.k += 1
 
-    def _integrate(self, flight: _Flight, w: NDArray[np.float64], delta: float, t_ns: int) -> None:
+    def _integrate(self, flight: _Flight, w: NDArray[np.float64], delta: float, now_ns: int) -> None:
         if flight.crashed:
             return
         following = self.aircraft.step(flight.x, flight.position, w, delta)
         if not all(-DIVERGED < value < DIVERGED for value in following.tolist()):
             flight.crashed = True
-            self._event("diverged", f"state beyond {DIVERGED:g} at sample {flight.k + 1}", t_ns)
+            self._event("diverged", f"state beyond {DIVERGED:g} at sample {flight.k + 1}", now_ns)
             return
         flight.x = following
 
@@ -324,18 +334,23 @@ class PlantNode:
             self._send(NamedValueInt(ms, "SAMPLE_K", flight.k))
         if d is not None:
             self._send(NamedValueInt(ms, "DELAY_K", d))
-        fields: dict[type, dict[str, float]] = {Attitude: dict.fromkeys(_ATTITUDE_FIELDS, 0.0)}
-        for sensor, value in zip(self._sensors, flight.x.tolist(), strict=True):
-            fields.setdefault(sensor.message, {})[sensor.field] = value * sensor.to_field
-        attitude, air = fields[Attitude], fields.get(AoaSsa)
+        attitude, air = self._fields(self._faulty_sensors.sense(flight.k, flight.x))
         self._send(Attitude(time_boot_ms=ms, **attitude))
         if air is not None and self.config.aoa:
             self._send(AoaSsa(t_ns // NS_PER_US, air.get("AOA", 0.0), air.get("SSA", 0.0)))
+        attitude, air = self._fields(flight.x)  # the air data system is another sensor, without faults
         condition = self.model.condition
         speed = condition.airspeed_m_s if condition is not None else 0.0
         climb = speed * math.sin(attitude["pitch"] - math.radians(air.get("AOA", 0.0) if air else 0.0))
         self._send(VfrHud(speed, speed, 0, 0, flight.altitude_m, climb))
         flight.altitude_m += climb * self.model.Ts
+
+    def _fields(self, x: NDArray[np.float64]) -> tuple[dict[str, float], dict[str, float] | None]:
+        """Return the fields of ATTITUDE and, where the model has any, of AOA_SSA that a state fills."""
+        fields: dict[type, dict[str, float]] = {Attitude: dict.fromkeys(_ATTITUDE_FIELDS, 0.0)}
+        for sensor, value in zip(self._sensors, x.tolist(), strict=True):
+            fields.setdefault(sensor.message, {})[sensor.field] = value * sensor.to_field
+        return fields[Attitude], fields.get(AoaSsa)
 
     def _send(self, message: Message) -> None:
         self._out.append((PORT, self.wire.encode(message)))
@@ -345,9 +360,9 @@ class PlantNode:
         refusals = {kind.value: n for kind, n in self.refusals.items()}
         self._event("counters", "plant counters", now_ns, {"rejects": rejects, "refusals": refusals})
 
-    def _event(self, kind: str, text: str, t_ns: int, data: dict[str, object] | None = None) -> None:
+    def _event(self, kind: str, text: str, now_ns: int, data: dict[str, object] | None = None) -> None:
         body = {"kind": kind, "node": "plant", "text": text, "data": data or {}}
-        self._records.append(Record("events", t_ns, body))
+        self._records.append(Record("events", now_ns, body))
 
 
 _ATTITUDE_FIELDS = ("roll", "pitch", "yaw", "rollspeed", "pitchspeed", "yawspeed")

@@ -3,6 +3,9 @@
 Each process streams its records over a loopback TCP connection (:mod:`autopilot.link.stream`), which is
 also its lifeline: closing our half ends it, and it ends by itself when we are gone. Its standard error
 goes to a file, whose end is its last words.
+
+A process may be killed and started again, frozen and thawed, and be given orders, all in flight. The hello of the
+new one is heard when the stream of the old one has ended, and none that the old one left behind.
 """
 
 from __future__ import annotations
@@ -11,10 +14,11 @@ import contextlib
 import os
 import secrets
 import selectors
+import signal
 import socket
 import subprocess
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from hmac import compare_digest
 from pathlib import Path
@@ -24,18 +28,27 @@ from typing import Any
 import orjson
 
 from autopilot.link.node import Record
+from autopilot.link.orders import Order, encode_order
 from autopilot.link.record import MAX_LINE_BYTES, decode_line
 from autopilot.link.stream import TOKEN_VARIABLE
-from autopilot.link.udp import Address
+from autopilot.link.udp import Address, true_ns
+from gains.table import InputError
 
-__all__ = ["ChildDied", "FlightFailed", "Supervisor"]
+__all__ = ["CAN_FREEZE", "MAX_ORDERS", "MAX_UNKNOWN", "ChildDied", "FlightFailed", "Supervisor"]
+
+CAN_FREEZE = sys.platform != "win32"
+"""Whether the system can let a program stand still (SIGSTOP)."""
 
 READ_BYTES = 1 << 18
 HELLO_TIMEOUT_S = 30.0
 STOP_TIMEOUT_S = 5.0
+DRAIN_TIMEOUT_S = 1.0
+"""Longest wait for what a killed program has sent; it is in the kernel, so it comes at once."""
 MAX_LAST_WORDS = 2000
 MAX_UNKNOWN = 16
 """Connections that have not said hello; the oldest is dropped for a further one."""
+MAX_ORDERS = 16
+"""Orders that wait for a program's hello; further ones are refused."""
 
 if sys.platform == "win32":
     _OWN_GROUP: dict[str, Any] = {"creationflags": subprocess.CREATE_NEW_PROCESS_GROUP}
@@ -71,14 +84,24 @@ class ChildDied(FlightFailed):
 
 @dataclass(slots=True)
 class _Child:
-    """One process."""
+    """One process, from its start to its death."""
 
     name: str
     process: subprocess.Popen[bytes]
     log: Path
+    log_start: int = 0
+    """Where in the log its own words begin."""
+    started_ns: int = 0
+    may_end: bool = False
     connection: socket.socket | None = None
     ports: dict[str, Address] = field(default_factory=dict)
+    orders: list[bytes] = field(default_factory=list)
+    """Those that wait for its hello."""
     ended: bool = False
+    """Its stream has ended."""
+    frozen: bool = False
+    mourned: bool = False
+    """Its death is known and was no failure."""
 
 
 @dataclass(slots=True, eq=False)
@@ -99,10 +122,24 @@ class Supervisor:
         Where the programs' standard error goes, as ``NAME.log``.
     write : callable
         Takes each record and its true time.
+
+    Attributes
+    ----------
+    malformed : int
+        Lines of a stream that were no records.
+    refused_orders : int
+        Orders that a program could not be given.
+    on_hello : callable
+        Called when a program says hello, with its name, its ports and how long after its start that is, ns.
+    on_exit : callable
+        Called when a program ends by itself that may, with its name, its exit code and its last words.
     """
 
     def __init__(self, folder: Path, write: Callable[[Record, int], None]) -> None:
         self.malformed = 0
+        self.refused_orders = 0
+        self.on_hello: Callable[[str, Mapping[str, Address], int], None] = lambda _name, _ports, _after_ns: None
+        self.on_exit: Callable[[str, int, str], None] = lambda _name, _code, _last_words: None
         self._folder = folder
         self._write = write
         self._token = secrets.token_hex(16)
@@ -114,12 +151,26 @@ class Supervisor:
         self._selector.register(self._listener, selectors.EVENT_READ)
         self._stopping = False
 
-    def start(self, name: str, arguments: Sequence[str]) -> None:
-        """Start ``python -m`` with the arguments, its record stream joined to ours."""
+    def start(self, name: str, arguments: Sequence[str], *, may_end: bool = False) -> None:
+        """Start ``python -m`` with the arguments, its record stream joined to ours; again, once it has been killed.
+
+        Parameters
+        ----------
+        name : str
+            The program, as it calls itself in its hello.
+        arguments : sequence of str
+            Module and command line.
+        may_end : bool
+            Whether it may end by itself, which is then told to ``on_exit``.
+        """
+        before = self._children.get(name)
+        assert before is None or before.mourned, f"{name} still runs"
         host, port = self._listener.getsockname()
         log = self._folder / f"{name}.log"
         command = [sys.executable, "-m", *arguments, "--stream", f"{host}:{port}"]
-        with log.open("wb") as stderr:
+        with log.open("wb" if before is None else "ab") as stderr:
+            log_start = stderr.tell()
+            started_ns = true_ns()
             process = subprocess.Popen(
                 command,
                 stdin=subprocess.DEVNULL,
@@ -128,7 +179,49 @@ class Supervisor:
                 env={**os.environ, TOKEN_VARIABLE: self._token},
                 **_OWN_GROUP,
             )
-        self._children[name] = _Child(name, process, log)
+        self._children[name] = _Child(name, process, log, log_start, started_ns, may_end)
+
+    def kill(self, name: str) -> None:
+        """Kill a program (SIGKILL) that shall be dead, or started again; what it has sent is passed on first."""
+        child = self._children[name]
+        self._notice(child)
+        child.process.kill()
+        child.process.wait()
+        child.mourned, child.frozen = True, False
+        deadline = monotonic() + DRAIN_TIMEOUT_S
+        while monotonic() < deadline and child.connection is not None and not child.ended:
+            self._listen(0.05)
+        self._listen(0.0)  # a connection without a hello
+
+    def freeze(self, name: str) -> None:
+        """Let a program stand still (SIGSTOP) until :meth:`thaw`.
+
+        Raises
+        ------
+        InputError
+            Where the system cannot.
+        """
+        if sys.platform == "win32":
+            raise InputError("freeze: expected a system that can stop a program (SIGSTOP), found Windows")
+        child = self._children[name]
+        child.frozen = True
+        child.process.send_signal(signal.SIGSTOP)
+
+    def thaw(self, name: str) -> None:
+        """Let a frozen program go on (SIGCONT)."""
+        child = self._children[name]
+        if sys.platform != "win32" and child.frozen:
+            child.process.send_signal(signal.SIGCONT)
+        child.frozen = False
+
+    def order(self, name: str, order: Order) -> None:
+        """Give a program an order, once it has said hello; count one that it cannot be given."""
+        child = self._children[name]
+        if child.mourned or child.ended or len(child.orders) >= MAX_ORDERS:
+            self.refused_orders += 1
+            return
+        child.orders.append(encode_order(order))
+        self._send_orders(child)
 
     def wait_ready(self, name: str, stopping: Callable[[], bool]) -> dict[str, Address]:
         """Wait until a program has bound its ports, and return them; empty when stopped before.
@@ -154,23 +247,18 @@ class Supervisor:
         Raises
         ------
         ChildDied
-            When a program has ended by itself.
+            When a program has ended by itself that may not.
         """
-        for key, _ in self._selector.select(timeout_s):
-            if key.fileobj is self._listener:
-                self._accept()
-            else:
-                self._read(key.data)
+        self._listen(timeout_s)
         if not self._stopping:
             for child in self._children.values():
-                code = child.process.poll()
-                if code is not None:
-                    raise ChildDied(child.name, code, self._last_words(child))
+                self._notice(child)
 
     def stop(self) -> list[str]:
         """End the programs, take their last records, and return the names of those that had to be killed."""
         self._stopping = True
         for child in self._children.values():
+            self.thaw(child.name)  # a frozen program hears nothing
             if child.connection is None:
                 child.process.terminate()
                 continue
@@ -199,6 +287,35 @@ class Supervisor:
             assert isinstance(key.fileobj, socket.socket)
             key.fileobj.close()
         self._selector.close()
+
+    def _listen(self, timeout_s: float) -> None:
+        """Take what has come, waiting at most ``timeout_s`` for it."""
+        for key, _ in self._selector.select(timeout_s):
+            if key.fileobj is self._listener:
+                self._accept()
+            else:
+                self._read(key.data)
+
+    def _notice(self, child: _Child) -> None:
+        """Notice when a program has ended; raise ChildDied if it may not."""
+        code = child.process.poll()
+        if code is None or child.mourned:
+            return
+        if not child.may_end:
+            raise ChildDied(child.name, code, self._last_words(child))
+        child.mourned = True
+        self.on_exit(child.name, code, self._last_words(child))
+
+    def _send_orders(self, child: _Child) -> None:
+        """Send a program the orders that wait, if it has said hello."""
+        if child.connection is None:
+            return
+        for line in child.orders:
+            try:
+                child.connection.sendall(line)  # tens of bytes into an empty buffer
+            except OSError:
+                self.refused_orders += 1  # it has just ended
+        child.orders.clear()
 
     def _accept(self) -> None:
         with contextlib.suppress(OSError):  # it is gone again, or there is no room for it
@@ -245,10 +362,12 @@ class Supervisor:
             ports = {str(name): (str(host), int(port)) for name, (host, port) in hello["ports"].items()}
         except (ValueError, KeyError, TypeError, AttributeError):
             return False
-        if not known or child.connection is not None:
+        if not known or child.connection is not None or child.mourned:
             return False
         child.connection, child.ports, connection.child = connection.socket, ports, child
         self._unknown.remove(connection)
+        self._send_orders(child)
+        self.on_hello(child.name, ports, true_ns() - child.started_ns)
         return True
 
     def _drop(self, connection: _Connection) -> None:
@@ -261,6 +380,6 @@ class Supervisor:
 
     def _last_words(self, child: _Child) -> str:
         """Return the end of what a program wrote to standard error, as one line."""
-        text = child.log.read_bytes()[-MAX_LAST_WORDS:].decode("utf-8", errors="replace")
+        text = child.log.read_bytes()[child.log_start :][-MAX_LAST_WORDS:].decode("utf-8", errors="replace")
         lines = [line.strip() for line in text.splitlines() if line.strip()]
         return lines[-1] if lines else ""

@@ -2,12 +2,18 @@
 
 It takes the records of all processes with true times since the start of the flight. Frames go to the
 files only; everything else is kept for the summary and the plot.
+
+A full disk ends the files and not the flight: what they lack is counted and told, the flight goes on, and
+``sitl recover`` reads what was written up to then.
 """
 
 from __future__ import annotations
 
 import base64
-from collections.abc import Mapping
+import contextlib
+import errno
+import os
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Self
 
@@ -47,6 +53,8 @@ class FlightRecorder:
         Records beyond MAX_KEPT.
     malformed : int
         Records that came from another process and were none.
+    files : dict of str to Path
+        What has been written, by its name in the summary.
 
     Raises
     ------
@@ -66,6 +74,8 @@ class FlightRecorder:
         self._tlog_topic = f"mavlink/{tlog_port}"
         self._mcap: McapRecorder | None = None
         self._tlog: TlogWriter | None = None
+        self._full = False
+        self._unsaved: list[str] = []
         if folder is None:
             return
         try:
@@ -90,10 +100,41 @@ class FlightRecorder:
         if self._mcap is not None:
             self._mcap.write(record, log_time_ns)
 
+    def fill_disk(self) -> None:
+        """Let the disk be full from now on: the fault ``disk-full``. All further writes fail."""
+        self._full = True
+        for writer in (self._mcap, self._tlog):
+            if writer is not None:
+                writer.fill_disk()
+
+    def save(self, name: str, path: Path, write: Callable[[Path], object]) -> None:
+        """Write a further file of the flight; where that fails, it is a problem for the summary, and no file.
+
+        Parameters
+        ----------
+        name : str
+            Of the file in the summary.
+        path : Path
+            Where it goes.
+        write : callable
+            Writes it there; an OSError of it is not passed on.
+        """
+        try:
+            if self._full:
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+            write(path)
+        except OSError as failure:
+            self._unsaved.append(f"{path}: {failure.strerror or failure}")
+            with contextlib.suppress(OSError):
+                path.unlink(missing_ok=True)  # a part of a file, or that of another flight
+        else:
+            self.files[name] = path
+
     @property
     def problems(self) -> list[str]:
         """What went wrong with the files, for the summary."""
         problems = [f"{w.error}: {w.lost} lost" for w in (self._mcap, self._tlog) if w is not None and w.error]
+        problems += self._unsaved
         if self._mcap is not None and self._mcap.refused:
             problems.append(f"{self._mcap.refused} records of too many topics are not in the files")
         if self.unkept:

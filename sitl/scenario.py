@@ -7,7 +7,7 @@ from a scenario, for either driver, and writes the command lines that build the 
 from __future__ import annotations
 
 import difflib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from importlib import resources
 from pathlib import Path
@@ -20,7 +20,7 @@ from autopilot.alpha import AlphaChoice
 from autopilot.app import AutopilotNode
 from autopilot.config import AutopilotConfig
 from autopilot.failsafe import Mode
-from autopilot.link.clock import Clock
+from autopilot.link.clock import NS_PER_S, Clock
 from autopilot.link.process import format_clock, parse_clock
 from autopilot.profile import parse_profile
 from gains.model import GainLaw, Model
@@ -28,11 +28,13 @@ from gains.store import load_law, load_model
 from gains.table import InputError, Table
 from gains.witnessfile import Witness, read_witness
 from sitl.aircraft.disturbance import HarmonicGust, SquareDelta
-from sitl.gate import Gate, check_flyable
-from sitl.impairment import LinkSpec
-from sitl.linkspec import format_spec, parse_link
+from sitl.faults import Fault, aircraft_faults, check_faults, format_fault, parse_fault
+from sitl.link.gate import Gate, check_flyable
+from sitl.link.impairment import LinkSpec
+from sitl.link.presets import parse_link
+from sitl.link.relay import RelayNode
+from sitl.link.spec import format_spec
 from sitl.plant import PlantConfig, PlantNode
-from sitl.relay import RelayNode
 
 __all__ = [
     "MAX_SEED",
@@ -84,6 +86,7 @@ METRICS = frozenset(
         "longest_saturation_s",
         "reentry_saturation_s",
         "late_ticks",
+        "recovery_s",
     }
 )
 """What of a summary a check may judge; of a variant's too, after ``variants.NAME.``."""
@@ -160,6 +163,8 @@ class Scenario:
         File of the delay sequence that the link imposes.
     witness : Witness or None
         That sequence.
+    faults : tuple of Fault
+        What goes wrong, and when.
     checks : tuple of Check
         What must hold at the end.
     variants : mapping
@@ -190,6 +195,7 @@ class Scenario:
     delta: SquareDelta | None = None
     witness_name: str | None = None
     witness: Witness | None = None
+    faults: tuple[Fault, ...] = ()
     checks: tuple[Check, ...] = ()
     variants: Mapping[str, Scenario] = field(default_factory=dict)
 
@@ -198,10 +204,32 @@ class Scenario:
         """Number of samples to fly."""
         return max(1, round(self.duration_s / self.plant.Ts))
 
+    def with_faults(self, faults: Iterable[Fault]) -> Scenario:
+        """Return the scenario with other faults.
+
+        Raises
+        ------
+        InputError
+            When they cannot be (:func:`sitl.faults.check_faults`).
+        """
+        faults = tuple(faults)
+        check_faults(faults, self.plant.states, round(self.duration_s * NS_PER_S))
+        return replace(self, faults=faults)
+
     def plant_node(self) -> PlantNode:
         """Return the plant, new."""
         return PlantNode(
-            PlantConfig(self.plant, self.x0, self.gust, self.delta, self.latch, self.servo_timeout, self.aoa)
+            PlantConfig(
+                self.plant,
+                self.x0,
+                self.gust,
+                self.delta,
+                self.latch,
+                self.servo_timeout,
+                self.aoa,
+                aircraft_faults(self.faults),
+                self.seed,
+            )
         )
 
     def relay_node(self) -> RelayNode:
@@ -299,6 +327,7 @@ def _parse(table: Table, name: str, gains_name: str | None, plant_name: str | No
         ),
     )
     parse_profile(scenario.reference, gains.model.Ts)
+    scenario = scenario.with_faults(_faults(table))
     if variants is None:
         return scenario
     return replace(scenario, variants={v: _variant(scenario, variants.table(v)) for v in variants})
@@ -355,6 +384,11 @@ def _delta(table: Table, plant: Model) -> SquareDelta | None:
     return SquareDelta(delta.number("amplitude", default=0.15), delta.integer("half_period", default=20, low=1))
 
 
+def _faults(table: Table) -> list[Fault]:
+    """Return the faults of the file, none without the key."""
+    return [parse_fault(text) for text in table.strings("faults", default=())]
+
+
 def _check(table: Table, metrics: frozenset[str], variants: tuple[str, ...]) -> Check:
     """Return a check, its metric one that there will be."""
     check = Check(
@@ -377,8 +411,9 @@ def _check(table: Table, metrics: frozenset[str], variants: tuple[str, ...]) -> 
 
 def _variant(scenario: Scenario, table: Table) -> Scenario:
     """Return the scenario with what the variant's table changes."""
+    faults = scenario.faults if table.strings("faults", default=None) is None else _faults(table)
     return replace(
-        scenario,
+        scenario.with_faults(faults),
         failsafe=_choice(table, "failsafe", ("on", "monitor"), scenario.failsafe),
         servo_timeout=_servo_timeout(table, scenario.servo_timeout),
         checks=(),
@@ -397,6 +432,9 @@ def plant_arguments(scenario: Scenario) -> list[str]:
         arguments += ["--gust", repr(scenario.gust.start_k * scenario.plant.Ts)]
     if scenario.delta is not None:
         arguments += ["--uncertainty", f"{scenario.delta.amplitude!r}:{scenario.delta.half_period}"]
+    if faults := aircraft_faults(scenario.faults):
+        arguments += ["--seed", str(scenario.seed)]
+        arguments += [word for fault in faults for word in ("--fault", format_fault(fault))]
     return arguments
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from bisect import bisect_left
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -16,7 +16,8 @@ from autopilot.failsafe import FLOWN_BY_FIRST_LAW, Mode
 from gains.model import GainLaw
 from gains.verify import verified
 from sitl.flightdata import FlightData
-from sitl.impairment import Fate
+from sitl.link.impairment import Fate
+from sitl.recovery import longest_recovery_s, recoveries
 from sitl.scenario import LINK_COUNTS, Check, Scenario
 from sitl.witness import witness_summary
 
@@ -61,12 +62,14 @@ def summarise(scenario: Scenario, kept: Sequence[Kept], flight: FlightData, *, v
 
     Errors are e = C x + D u - yr, Eq. (10), in the units of the outputs, against the reference model that
     starts at rest at k = 0 and is never re-initialised: what failsafe costs is in them. Samples at which no law was to
-    fly, as the ground had disarmed the vehicle or flew it by hand, are left out.
+    fly, as the ground had disarmed the vehicle or flew it by hand, are left out. A plant that restarts is at k = 0
+    again, and so is the reference model; while it is dead there are no errors.
     """
     error = np.abs(flight.flown_error[:, 0])
     last_second = max(1, round(1.0 / scenario.plant.Ts))
     transitions = [body for topic, _, body in kept if topic == "events" and body["kind"] == "failsafe"]
     leaving = [t for t in transitions if t["data"]["from"] != Mode.STANDBY]
+    faults = recoveries(kept)
     summary = {
         "scenario": scenario.name,
         "title": scenario.title,
@@ -76,7 +79,7 @@ def summarise(scenario: Scenario, kept: Sequence[Kept], flight: FlightData, *, v
         "virtual": virtual,
         "certificate": _certificate(scenario.gains),
         "conservative": _conservative(scenario.gains),
-        "duration_s": len(flight.time_s) * scenario.plant.Ts,
+        "duration_s": _span(flight) * scenario.plant.Ts,
         "samples": len(flight.time_s),
         "released_s": int(np.count_nonzero(~flight.engaged)) * scenario.plant.Ts,
         "diverged": any(topic == "events" and body["kind"] == "diverged" for topic, _, body in kept),
@@ -94,6 +97,8 @@ def summarise(scenario: Scenario, kept: Sequence[Kept], flight: FlightData, *, v
         "longest_saturation_s": _longest(_at_limit(flight)) * scenario.plant.Ts,
         "reentry_saturation_s": _reentry_saturation_s(flight),
         "late_ticks": int(np.count_nonzero(flight.late_ns > LATE_NS)),
+        "faults": [asdict(fault) for fault in faults],
+        "recovery_s": longest_recovery_s(faults),
     }
     if scenario.witness is not None:
         gated = sum(topic == "link/down" and body["fate"] == Fate.GATED for topic, _, body in kept)
@@ -101,10 +106,15 @@ def summarise(scenario: Scenario, kept: Sequence[Kept], flight: FlightData, *, v
     return summary
 
 
+def _span(flight: FlightData) -> int:
+    """Return the length of the flight, samples: those that a dead plant did not fly count, too."""
+    return round(float(flight.time_s[-1] - flight.time_s[0]) / flight.model.Ts) + 1
+
+
 def _mode_s(flight: FlightData) -> dict[str, float]:
     """Return for how long each mode had the elevator, s; before the first command nobody has."""
     seconds = {mode.value: sum(m.end_s - m.start_s for m in flight.modes if m.mode == mode) for mode in Mode}
-    rest = len(flight.time_s) * flight.model.Ts - sum(seconds.values())
+    rest = _span(flight) * flight.model.Ts - sum(seconds.values())
     return {**seconds, Mode.STANDBY.value: seconds[Mode.STANDBY.value] + max(0.0, rest)}
 
 
@@ -135,11 +145,11 @@ def delay_summary(flight: FlightData) -> dict[str, Any]:
     """
     true = flight.d[~np.isnan(flight.d)].astype(int)
     first: dict[int, int] = {}
-    for k, j in zip(flight.k, flight.j, strict=True):
+    for start, k, j in zip(flight.start, flight.k, flight.j, strict=True):
         if not np.isnan(j):
-            first.setdefault(int(j), int(k - j))
+            first.setdefault(int(start + j), int(k - j))
     forecast = np.column_stack([flight.forecast, flight.forecast_low, flight.forecast_high])
-    forecasts = dict(zip(flight.command_j.tolist(), forecast, strict=True))
+    forecasts = dict(zip(flight.command_sample.tolist(), forecast, strict=True))
     misses = np.array([forecasts[j] - d for j, d in first.items() if j in forecasts]).reshape(-1, 3)
     misses = misses[~np.isnan(misses[:, 0])]
     known, covered = misses[:, 0], (misses[:, 1] <= 0) & (misses[:, 2] >= 0)
@@ -273,6 +283,8 @@ def summary_table(summary: Mapping[str, Any], verdicts: Sequence[Verdict]) -> Gr
     grid.add_row("failsafe", f"{summary['failsafe_events']} transitions, {summary['mode_at_end']} at the end")
     if "witness" in summary:
         grid.add_row("witness", _witness_text(summary["witness"]))
+    for fault in summary.get("faults", []):
+        grid.add_row("fault", _fault_text(fault))
     grid.add_row("late samples", f"{summary['late_ticks']} by more than 1 ms")
     for name, variant in summary.get("variants", {}).items():
         peak = np.degrees(variant["max_error_rad"])
@@ -303,6 +315,14 @@ def _forecast_text(delay: Mapping[str, Any]) -> str:
     exact, near = delay["estimated_exact_fraction"], delay["within_one_fraction"]
     covered, unknown = delay["covered_fraction"], delay["unknown_fraction"]
     return f"exact {exact:.1%}, within one sample {near:.1%}, inside the interval {covered:.1%}, unknown {unknown:.1%}"
+
+
+def _fault_text(fault: Mapping[str, Any]) -> str:
+    if fault["end_s"] is None:
+        return f"{fault['fault']}: lasts to the end"
+    if fault["recovered_s"] is None:
+        return f"{fault['fault']}: the law does not get the elevator back"
+    return f"{fault['fault']}: the law has the elevator {fault['recovered_s'] - fault['end_s']:.3g} s after its end"
 
 
 def _witness_text(witness: Mapping[str, Any]) -> str:

@@ -24,7 +24,7 @@ from autopilot.link.clock import NS_PER_S
 from autopilot.link.node import Record
 from autopilot.link.servo import travel_of
 from sitl.braille import Part, bar, count, fit, histogram, input_quantity, output_quantity, percent, plain, plot
-from sitl.impairment import Fate
+from sitl.link.impairment import Fate
 from sitl.scenario import Scenario
 
 __all__ = ["MODE_STYLES", "FlightView"]

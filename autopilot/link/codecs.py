@@ -9,6 +9,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Callable
 from dataclasses import dataclass, fields
+from operator import attrgetter
 from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
@@ -54,6 +55,9 @@ class Codec:
         The message of such values.
     floats : tuple of str
         Fields that must be finite.
+    float_sum : callable or None
+        Their sum: finite only if each of them is, as doubles hold any sum of a few single-precision
+        numbers. None without floats.
     """
 
     id: int
@@ -63,6 +67,7 @@ class Codec:
     values: Callable[[Any], tuple[Any, ...]]
     message: Callable[[tuple[Any, ...]], Any]
     floats: tuple[str, ...] = ()
+    float_sum: Callable[[Any], float] | None = None
 
 
 def _codec(
@@ -73,8 +78,21 @@ def _codec(
 ) -> Codec:
     """Return the codec of a message by the dialect's row for it: number, payload format, CRC extra."""
     number = native.id
+    float_sum: Callable[[Any], float] | None = None
+    if len(floats) == 1:
+        float_sum = attrgetter(*floats)
+    elif floats:
+        floats_of = attrgetter(*floats)
+        float_sum = lambda m: sum(floats_of(m))  # noqa: E731  one expression, as the codecs below
     return Codec(
-        number, number.to_bytes(3, "little"), bytes((native.crc_extra,)), native.unpacker, values, message, floats
+        number,
+        number.to_bytes(3, "little"),
+        bytes((native.crc_extra,)),
+        native.unpacker,
+        values,
+        message,
+        floats,
+        float_sum,
     )
 
 

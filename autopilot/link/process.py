@@ -10,7 +10,7 @@ import gc
 import re
 import signal
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack, closing
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -18,11 +18,14 @@ from typing import Any, TypeVar
 import click
 
 from autopilot.link.clock import NS_PER_S, Clock
+from autopilot.link.kernel import buffer_bytes, largest_buffer_bytes, sharpen_timers
 from autopilot.link.keyring import Keyring
 from autopilot.link.node import Node, Record
+from autopilot.link.orders import obey
+from autopilot.link.ports import RECEIVE_BUFFER_BYTES, Address, UdpPort, parse_address, true_ns
 from autopilot.link.record import McapRecorder
 from autopilot.link.stream import StreamSink
-from autopilot.link.udp import Address, RecordSink, UdpDriver, UdpPort, parse_address, true_ns
+from autopilot.link.udp import RecordSink, UdpDriver
 from gains.table import InputError
 
 __all__ = [
@@ -147,6 +150,7 @@ def run_node(
     banner: str = "",
     control: int = 1,
     keyring: Keyring | None = None,
+    spin_ns: int = 0,
 ) -> None:
     """Run a node over UDP until Ctrl-C, SIGTERM or the end of the record stream.
 
@@ -170,6 +174,8 @@ def run_node(
         How many of the ports are control ports.
     keyring : Keyring, optional
         The keys of the ports; it is closed at the end.
+    spin_ns : int
+        How long before a deadline the driver stops sleeping, as :class:`autopilot.link.udp.UdpDriver` takes it.
 
     Raises
     ------
@@ -191,36 +197,76 @@ def run_node(
         for open_port in openers:
             ports.append(open_port())
             stack.callback(ports[-1].socket.close)  # whatever else cannot be opened
-        sink: RecordSink | None = None
-        stream: StreamSink | None = None
-        if options.stream is not None:
-            bound = {port.name: port.local for port in ports}
-            sink = stream = StreamSink(options.stream, name, bound)
-            stack.callback(stream.close)
-        elif options.record is not None:
-            try:
-                recorder = stack.enter_context(McapRecorder(options.record, metadata))
-            except OSError as error:
-                raise InputError(f"{options.record}: {error.strerror or error}") from None
-            sink = _FileSink(recorder)
-        if banner:
-            click.echo(banner, err=True)
+        sink, stream = _open_sink(stack, name, ports, options, metadata)
+        for line in filter(None, (banner, _buffers_said(ports))):
+            click.echo(line, err=True)
+        sharpen_timers()
         gc.collect()
         gc.freeze()  # what is loaded now stays: no later collection has to look at it
-        on_pass = keyring.pass_ if keyring is not None else None
-        driver = stack.enter_context(
-            closing(UdpDriver(node, ports, options.clock, sink, tap=tap, control=control, on_pass=on_pass))
-        )
+        driver = UdpDriver(node, ports, options.clock, sink, tap=tap, control=control, spin_ns=spin_ns)
+        stack.callback(driver.close)
+        driver.on_pass = _chores(driver, keyring, stream)
         driver.run(lambda: stopped or (stream is not None and stream.closed))
         if sink is not None:
             lost = stream.lost if stream is not None else 0
             sink.write(_port_counters(name, ports, lost, driver.clock.node_ns(true_ns())), true_ns())
 
 
+def _open_sink(
+    stack: ExitStack, name: str, ports: Sequence[UdpPort], options: ProcessOptions, metadata: Mapping[str, str]
+) -> tuple[RecordSink | None, StreamSink | None]:
+    """Return where the records go, and the stream if it is one; both end with the stack."""
+    if options.stream is not None:
+        stream = StreamSink(options.stream, name, {port.name: port.local for port in ports})
+        stack.callback(stream.close)
+        return stream, stream
+    if options.record is None:
+        return None, None
+    try:
+        return _FileSink(stack.enter_context(McapRecorder(options.record, metadata))), None
+    except OSError as error:
+        raise InputError(f"{options.record}: {error.strerror or error}") from None
+
+
+def _chores(driver: UdpDriver, keyring: Keyring | None, stream: StreamSink | None) -> Callable[[int], None]:
+    """Return what is done at the end of each pass: writing timestamps ahead, carrying out orders."""
+
+    def on_pass(now_ns: int) -> None:
+        if keyring is not None:
+            keyring.pass_(now_ns)
+        if stream is not None:
+            for order in stream.orders():
+                obey(order, driver)
+
+    return on_pass
+
+
+def _buffers_said(ports: Sequence[UdpPort]) -> str:
+    """Return the line about receive buffers of ports that take bursts; empty for a program that has none."""
+    wide = [port for port in ports if port.asked_bytes > RECEIVE_BUFFER_BYTES]
+    if not wide:
+        return ""
+    limit = largest_buffer_bytes()
+    given = ", ".join(f"{port.name} {_mebi(buffer_bytes(port.socket))} of {_mebi(port.asked_bytes)}" for port in wide)
+    return f"receive buffers: {given} (net.core.rmem_max: {'unknown' if limit is None else _mebi(limit)})"
+
+
+def _mebi(size: int) -> str:
+    return f"{size / (1 << 20):.3g} MiB"
+
+
 def _port_counters(name: str, ports: Sequence[UdpPort], records_lost: int, t_ns: int) -> Record:
     """Return the event that says what the ports refused and could not send, and what was not recorded."""
     data = {
-        port.name: {"strangers": port.strangers, "unsent": port.unsent, "overflowed": port.overflowed} for port in ports
+        port.name: {
+            "strangers": port.strangers,
+            "unsent": port.unsent,
+            "overflowed": port.overflowed,
+            "unstamped": port.unstamped if port.stamps else None,
+            "buffer_bytes": buffer_bytes(port.socket),
+        }
+        for port in ports
     }
-    body = {"kind": "ports", "node": name, "text": f"{name} ports", "data": {**data, "records_lost": records_lost}}
+    limits = {"records_lost": records_lost, "buffer_limit_bytes": largest_buffer_bytes()}
+    body = {"kind": "ports", "node": name, "text": f"{name} ports", "data": {**data, **limits}}
     return Record("events", t_ns, body)

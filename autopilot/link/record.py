@@ -6,12 +6,13 @@ recording and is counted, not raised. Nothing of the wall clock goes into a file
 bytes.
 
 Each finished chunk goes to the operating system in one write, at the latest when the messages in it span
-``MAX_CHUNK_NS``: a killed process loses less than one second.
+``MAX_CHUNK_NS``, and the frames of a tlog likewise: a killed process loses less than one second.
 """
 
 from __future__ import annotations
 
 import base64
+import errno
 import os
 from collections.abc import Iterator, Mapping
 from io import FileIO
@@ -48,6 +49,7 @@ MAX_TOPICS = 64
 CHUNK_BYTES = 1 << 14
 MAX_CHUNK_NS = 500_000_000
 FRAMES_PER_FLUSH = 64
+MAX_FLUSH_US = MAX_CHUNK_NS // 1000
 METADATA_NAME = "flight"
 
 _PROFILE = "lagproof"
@@ -124,6 +126,7 @@ class _File:
         self._raw = FileIO(path, "w")
         self._pending = bytearray()
         self._length = 0
+        self._full = False
         self.error = ""
 
     def write(self, data: bytes) -> int:
@@ -147,10 +150,16 @@ class _File:
         self._pending.clear()
         try:
             while data and not self.error:
+                if self._full:
+                    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
                 data = data[self._raw.write(data) :]
         except OSError as failure:
             self._fail(failure)
         return not self.error
+
+    def fill_disk(self) -> None:
+        """Let every further write fail as on a full disk."""
+        self._full = True
 
     def close(self) -> bool:
         done = self.drain()
@@ -241,6 +250,10 @@ class McapRecorder:
         if self._file.pending:
             self._drain()
 
+    def fill_disk(self) -> None:
+        """Let the disk be full from now on, on demand: what has not reached the file by now does not."""
+        self._file.fill_disk()
+
     def close(self) -> None:
         """Write the last chunk and the summary, and close the file; a second call does nothing."""
         if self._closed:
@@ -296,6 +309,7 @@ class TlogWriter:
         self.lost = 0
         self._file = _File(path)
         self._unsaved = 0
+        self._first_us = 0
 
     @property
     def error(self) -> str:
@@ -307,10 +321,16 @@ class TlogWriter:
         if self._file.error:
             self.lost += 1
             return
+        if not self._unsaved:
+            self._first_us = time_us
         self._file.write(time_us.to_bytes(8, "big") + frame)
         self._unsaved += 1
-        if self._unsaved >= FRAMES_PER_FLUSH:
+        if self._unsaved >= FRAMES_PER_FLUSH or time_us - self._first_us >= MAX_FLUSH_US:
             self._drain()
+
+    def fill_disk(self) -> None:
+        """Let the disk be full from now on, on demand: what has not reached the file by now does not."""
+        self._file.fill_disk()
 
     def close(self) -> None:
         """Write what is left and close the file."""

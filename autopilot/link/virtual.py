@@ -2,18 +2,26 @@
 
 Events are ordered by true time; at equal instants deliveries come before ticks, then node order, then
 sequence. Nothing else decides, so a flight is the same bytes for the same seed.
+
+Between two events a node may be killed and replaced, frozen and thawed, muted, and its clock may be set or given
+another rate: what happens to programs on real machines. The node is not told.
 """
 
 from __future__ import annotations
 
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from enum import StrEnum
 
 from autopilot.link.clock import Clock
 from autopilot.link.node import Node, Record
 
-__all__ = ["Participant", "VirtualNetwork"]
+__all__ = ["MAX_WAITING", "Loss", "Participant", "VirtualNetwork"]
+
+MAX_WAITING = 256
+"""Datagrams that wait for a frozen node unless it says otherwise: small ones in a socket buffer of 208 KiB, as Linux
+has it by default."""
 
 Sink = Callable[[Record, int], None]
 """Takes a record and the true time at which it was made."""
@@ -22,13 +30,43 @@ Tap = Callable[[str, str, str, bytes, int], None]
 """Sees every datagram of a node: node, port, "sent" or "received", bytes, true time."""
 
 
+class Loss(StrEnum):
+    """Why a datagram got lost between two nodes; what an impaired link loses is the relay's business."""
+
+    DEAD = "dead"
+    """Whom it was for did not live, or died before taking it."""
+    OVERFLOW = "overflow"
+    """Too many waited for a frozen node."""
+    MUTE = "mute"
+    """Its sender was mute."""
+
+
 @dataclass(slots=True)
 class Participant:
-    """A node, its name and its clock."""
+    """A node, its name and its clock.
+
+    Attributes
+    ----------
+    name : str
+    node : Node
+    clock : Clock
+    max_waiting : int
+        Datagrams that may wait for it while it is frozen.
+    """
 
     name: str
     node: Node
     clock: Clock
+    max_waiting: int = MAX_WAITING
+
+
+@dataclass(slots=True)
+class _State:
+    """What has been done to a node; the first two keep it from anything."""
+
+    dead: bool = False
+    frozen: bool = False
+    mute: bool = False
 
 
 class VirtualNetwork:
@@ -46,6 +84,13 @@ class VirtualNetwork:
         Sees the datagrams of the nodes in ``tapped``.
     tapped : sequence of str
         Names of the nodes whose datagrams the tap sees.
+
+    Attributes
+    ----------
+    now_ns : int
+        True time.
+    losses : mapping of str to Counter
+        Datagrams lost at each node, by :class:`Loss`.
     """
 
     def __init__(
@@ -66,15 +111,63 @@ class VirtualNetwork:
         self._deliveries: list[deque[tuple[str, bytes]]] = [deque() for _ in self._participants]
         self._deadlines: list[int | None] = [None] * len(self._participants)
         self._due: list[int | None] = [None] * len(self._participants)
+        self._states = [_State() for _ in self._participants]
+        self.losses: dict[str, Counter[Loss]] = {p.name: Counter() for p in self._participants}
         for i in range(len(self._participants)):
             self._schedule(i)
+
+    # What may happen to a node
 
     def replace(self, name: str, node: Node, clock: Clock) -> None:
         """Boot a new node under an old name, as after a crash: datagrams under way still arrive."""
         i = self._index[name]
-        self._participants[i] = Participant(name, node, clock)
-        self._deadlines[i] = self._due[i] = None
-        self._schedule(i)
+        self._participants[i] = Participant(name, node, clock, self._participants[i].max_waiting)
+        self._states[i] = _State()
+        self._schedule(i, anew=True)
+
+    def kill(self, name: str) -> None:
+        """Let a node die: what waited for it is lost, and what comes, until it is replaced."""
+        i = self._index[name]
+        self._states[i].dead = True
+        self.losses[name][Loss.DEAD] += len(self._deliveries[i])
+        self._deliveries[i].clear()
+        self._schedule(i, anew=True)
+
+    def freeze(self, name: str) -> None:
+        """Let a node stand still: what comes waits, as far as there is room, and so does what is due."""
+        i = self._index[name]
+        self._states[i].frozen = True
+        self._schedule(i, anew=True)
+
+    def thaw(self, name: str) -> None:
+        """Let a frozen node go on: it takes all that waits, and then does all that is due."""
+        i = self._index[name]
+        self._states[i].frozen = False
+        self._schedule(i, anew=True)
+
+    def mute(self, name: str, active: bool) -> None:
+        """Let all that a node sends get lost, or no longer so."""
+        self._states[self._index[name]].mute = active
+
+    def clock(self, name: str) -> Clock:
+        """Return a node's clock as it runs now."""
+        return self._participants[self._index[name]].clock
+
+    def step_clock(self, name: str, by_ns: int) -> None:
+        """Set a node's clock forward, or back."""
+        clock = self.clock(name)
+        self._set_clock(name, Clock(clock.offset_ns + by_ns, clock.drift_ppb, clock.boot_ns))
+
+    def drift_clock(self, name: str, drift_ppb: int) -> None:
+        """Give a node's clock another rate; it goes on from what it shows."""
+        self._set_clock(name, Clock(self.clock(name).node_ns(self.now_ns), drift_ppb, self.now_ns))
+
+    def _set_clock(self, name: str, clock: Clock) -> None:
+        i = self._index[name]
+        self._participants[i].clock = clock
+        self._schedule(i, anew=True)
+
+    # Events
 
     def run(self, until: Callable[[], bool], limit_ns: int) -> None:
         """Fly until ``until()`` holds or true time passes ``limit_ns``."""
@@ -94,7 +187,7 @@ class VirtualNetwork:
     def _deliver(self) -> bool:
         """Hand over what is under way to the first node that has something; wires take no time."""
         for i, waiting in enumerate(self._deliveries):
-            if waiting:
+            if waiting and not self._states[i].frozen:
                 port, datagram = waiting.popleft()
                 p = self._participants[i]
                 if self._tapped[i]:
@@ -103,6 +196,16 @@ class VirtualNetwork:
                 self._collect(i)
                 return True
         return False
+
+    def _deliver_to(self, i: int, port: str, datagram: bytes) -> None:
+        """Put a datagram before a node, if there is one, and room."""
+        state, waiting = self._states[i], self._deliveries[i]
+        if state.dead:
+            self.losses[self._participants[i].name][Loss.DEAD] += 1
+        elif state.frozen and len(waiting) >= self._participants[i].max_waiting:
+            self.losses[self._participants[i].name][Loss.OVERFLOW] += 1
+        else:
+            waiting.append((port, datagram))
 
     def _earliest(self) -> int:
         """Return the node whose tick is due first, the first of equals."""
@@ -114,11 +217,11 @@ class VirtualNetwork:
                     break  # what is overdue is due now, and of equals the first counts
         return earliest
 
-    def _schedule(self, i: int) -> None:
-        """Ask a node for its deadline, and map it to true time when it is a new one."""
-        p = self._participants[i]
-        deadline_ns = p.node.next_deadline_ns()
-        if deadline_ns != self._deadlines[i]:
+    def _schedule(self, i: int, *, anew: bool = False) -> None:
+        """Ask a node for its deadline, and map it to true time when it is a new one, or the node or its clock is."""
+        p, state = self._participants[i], self._states[i]
+        deadline_ns = None if state.dead or state.frozen else p.node.next_deadline_ns()
+        if anew or deadline_ns != self._deadlines[i]:
             self._deadlines[i] = deadline_ns
             self._due[i] = None if deadline_ns is None else p.clock.true_ns(deadline_ns)
 
@@ -126,11 +229,14 @@ class VirtualNetwork:
         """Take what a node has sent and recorded, and its new deadline."""
         p = self._participants[i]
         for port, datagram in p.node.outgoing():
+            if self._states[i].mute:
+                self.losses[p.name][Loss.MUTE] += 1
+                continue
             if self._tapped[i]:
                 self._tap(p.name, port, "sent", datagram, self.now_ns)  # type: ignore[misc]
             far = self._wires.get((i, port))
             if far is not None:
-                self._deliveries[far[0]].append((far[1], datagram))
+                self._deliver_to(far[0], far[1], datagram)
         records = p.node.records()
         if self._sink is not None:
             for record in records:

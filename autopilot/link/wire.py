@@ -227,9 +227,8 @@ class Wire:
         size = codec.payload.size
         payload = frame[start:end].ljust(size, b"\0")[:size]  # trailing zeros are not sent; extensions may follow
         message: Message = codec.message(codec.payload.unpack(payload))
-        for name in codec.floats:
-            if not math.isfinite(getattr(message, name)):
-                return Reject.NON_FINITE
+        if codec.float_sum is not None and not math.isfinite(codec.float_sum(message)):
+            return Reject.NON_FINITE
         return source, message
 
 

@@ -14,11 +14,14 @@ from dataclasses import dataclass, field
 import pytest
 
 from autopilot.link import udp
-from autopilot.link.clock import NS_PER_MS, NS_PER_S, Clock
+from autopilot.link.clock import NS_PER_MS, NS_PER_S, NS_PER_US, Clock
 from autopilot.link.node import Record
+from autopilot.link.ports import LATCH_SILENCE_NS
 from autopilot.link.udp import (
-    LATCH_SILENCE_NS,
     MAX_PER_PASS,
+    MAX_SPIN_NS,
+    MAX_WAIT_NS,
+    SPIN_SHARE,
     UdpDriver,
     UdpPort,
     dial,
@@ -266,7 +269,7 @@ def test_an_address_that_cannot_be_resolved_is_refused(monkeypatch, open_port):
     def nobody_knows(*_args, **_more):
         raise socket.gaierror(socket.EAI_NONAME, "Name or service not known")
 
-    monkeypatch.setattr(udp.socket, "getaddrinfo", nobody_knows)
+    monkeypatch.setattr(socket, "getaddrinfo", nobody_knows)
     with pytest.raises(InputError, match=r"address host\.invalid:14600: cannot be resolved"):
         open_port("p", ("host.invalid", 14600))
 
@@ -377,6 +380,7 @@ class Queue:
     name: str
     coming: deque[tuple[int, bytes]]
     socket: None = None
+    stamps: bool = False
 
     def ready(self, now_ns: int) -> bool:
         return bool(self.coming) and self.coming[0][0] <= now_ns
@@ -496,6 +500,118 @@ def test_the_next_in_turn_is_the_first_that_is_ready_of_all_in_order_after_the_l
         for last in range(-1, count):
             order = [*range(last + 1, count), *range(last + 1)]
             assert next_in_turn(ready, last) == next((i for i in order if ready[i]), None)
+
+
+class Stamped(Queue):
+    """A queue that knows when its datagrams came."""
+
+    came = 0
+
+    def receive(self, now_ns: int) -> bytes | None:
+        self.came = self.coming[0][0] if self.ready(now_ns) else now_ns
+        return super().receive(now_ns)
+
+    def came_ns(self, _now_ns: int) -> int:
+        return self.came
+
+
+def test_a_node_is_told_when_a_datagram_came_and_does_what_is_due_at_the_time_that_it_is(monkeypatch):
+    control_ns = COST_NS["control"]
+    queue = Stamped("control", deque([(-9, b"a"), (-7, b"b")]), stamps=True)  # both wait since before the start
+    world = World([queue], period_ns=NS_PER_S)
+    world.fly(monkeypatch)
+    assert world.log == [("control", b"a", -9), ("tick", b"0", control_ns), ("control", b"b", -7)]
+
+
+# sleeping and spinning, in virtual time
+
+LATE_NS = 60 * NS_PER_US
+"""How late a sleep ends."""
+LOOK_NS = 2 * NS_PER_US
+SPIN_NS = 300 * NS_PER_US
+
+
+@dataclass
+class Sleeper(Probe):
+    """A node that is due periodically, in a system whose sleeps end late."""
+
+    period_ns: int = SAMPLE_NS
+    now_ns: int = 0
+    comes_ns: int = 1 << 62
+    """When there is a datagram."""
+    sleeps: list[tuple[int, int]] = field(default_factory=list)
+    spun_ns: int = 0
+    late_ns: list[int] = field(default_factory=list)
+
+    def tick(self, now_ns):
+        self.late_ns.append(now_ns - self.deadline_ns)
+        self.deadline_ns += self.period_ns
+
+    def select(self, numbers, _writing, _failing, wait_s):
+        wait_ns = round(wait_s * NS_PER_S)
+        if wait_ns:
+            self.sleeps.append((self.now_ns, wait_ns))
+            self.now_ns += wait_ns + LATE_NS
+        else:
+            self.spun_ns += LOOK_NS
+            self.now_ns += LOOK_NS
+        came = self.now_ns >= self.comes_ns
+        self.comes_ns = 1 << 62 if came else self.comes_ns
+        return list(numbers) if came else [], [], []
+
+    def run(self, monkeypatch: pytest.MonkeyPatch, peer: socket.socket, passes_made: int, spin_ns: int) -> None:
+        """Make passes; a datagram waits in the socket until its time has come."""
+        self.deadline_ns = self.period_ns
+        port = dial("p", peer.getsockname())
+        peer.sendto(b"x", port.local)
+        monkeypatch.setattr(udp, "true_ns", lambda: self.now_ns)
+        monkeypatch.setattr(select, "select", self.select)
+        with closing(UdpDriver(self, [port], Clock(), spin_ns=spin_ns)) as driver:
+            driver.run(passes(passes_made))
+
+
+def test_a_driver_that_sleeps_to_the_deadline_is_as_late_as_its_sleep(monkeypatch, peer):
+    node = Sleeper()
+    node.run(monkeypatch, peer, 5, spin_ns=0)
+    assert node.late_ns == [LATE_NS] * 5
+    assert node.spun_ns == 0
+
+
+def test_a_driver_that_spins_sleeps_until_then_and_is_as_late_as_one_look(monkeypatch, peer):
+    node = Sleeper()
+    node.run(monkeypatch, peer, 5, spin_ns=SPIN_NS)
+    assert len(node.late_ns) == len(node.sleeps) == 5
+    assert all(0 <= late_ns < LOOK_NS for late_ns in node.late_ns)
+    for n, (begin_ns, wait_ns) in enumerate(node.sleeps, 1):
+        assert begin_ns + wait_ns == n * SAMPLE_NS - SPIN_NS
+    assert SPIN_NS - LATE_NS <= node.spun_ns / 5 <= SPIN_NS - LATE_NS + LOOK_NS
+
+
+def test_a_datagram_that_comes_while_it_spins_is_served_at_once(monkeypatch, peer):
+    comes_ns = SAMPLE_NS - SPIN_NS // 2
+    node = Sleeper(comes_ns=comes_ns)
+    node.run(monkeypatch, peer, 2, spin_ns=SPIN_NS)
+    ((_, datagram, now_ns),) = node.got
+    assert datagram == b"x"
+    assert comes_ns <= now_ns < comes_ns + LOOK_NS
+    assert len(node.sleeps) == 1  # it spins on, up to the deadline
+    assert [0 <= late_ns < LOOK_NS for late_ns in node.late_ns] == [True]
+
+
+def test_a_driver_does_not_spin_for_a_deadline_that_is_further_than_its_longest_sleep(monkeypatch, peer):
+    node = Sleeper(period_ns=10 * MAX_WAIT_NS)
+    node.run(monkeypatch, peer, 5, spin_ns=SPIN_NS)
+    assert [wait_ns for _, wait_ns in node.sleeps] == [MAX_WAIT_NS] * 5
+    assert node.spun_ns == 0
+
+
+@pytest.mark.parametrize("spin_ns", [SPIN_NS, MAX_SPIN_NS])
+def test_spinning_takes_no_more_than_its_share_of_the_time(monkeypatch, peer, spin_ns):
+    node = Sleeper(period_ns=110 * NS_PER_US)
+    node.run(monkeypatch, peer, 3000, spin_ns=spin_ns)
+    assert node.now_ns > 10 * MAX_SPIN_NS
+    assert node.spun_ns <= node.now_ns / SPIN_SHARE + MAX_SPIN_NS + LOOK_NS
+    assert node.sleeps
 
 
 # what the node lives on

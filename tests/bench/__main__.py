@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from rich.console import Console
 from rich.table import Table
 
-from tests.bench import certify, design, estimators, exact, flight, flood, turnaround
+from tests.bench import certify, design, estimators, exact, flight, flood, relay, turnaround
 
 
 @dataclass(frozen=True)
@@ -35,6 +35,7 @@ def main() -> int:
         flight.measure,
         turnaround.measure,
         flood.measure,
+        relay.measure,
     ]
     rows = [Row(*row) for bench in benches for row in bench()]
     table = Table("measured", "ratio", "limit", "", title=f"{platform.machine()}, Python {platform.python_version()}")

@@ -27,7 +27,7 @@ from dataclasses import dataclass, field
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
-from tests.bench.turnaround import PERIOD_S, FakePlant
+from tests.bench.turnaround import PERIOD_S, REFERENCE, FakePlant
 
 STRANGER_HZ = 20_000
 STATION_HZ = 2_000
@@ -214,7 +214,10 @@ def _measure(how: str, *, through_relay: bool) -> list[tuple[str, float, float, 
             )
         near = relay_port if through_relay else plant_port
         stack.enter_context(
-            _running("autopilot", "--plant", f"{HOME}:{near}", "--gcs", f"udpout:{HOME}:{station_port}")
+            _running(
+                *("autopilot", "--plant", f"{HOME}:{near}", "--gcs", f"udpout:{HOME}:{station_port}"),
+                *("--reference", REFERENCE),
+            )
         )
         assert plant.started(), "the autopilot did not start"
         assert plant.peer is not None

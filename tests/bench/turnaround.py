@@ -6,6 +6,7 @@ loop: the ratio is that of the two medians.
 
 from __future__ import annotations
 
+import math
 import socket
 import statistics
 import subprocess
@@ -13,11 +14,18 @@ import sys
 import time
 from collections.abc import Callable
 
+import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as dialect
+
+from autopilot.link.servo import travel_of
+from gains.store import load_model
+from sitl.aircraft.linear import LinearAircraft
 
 SAMPLES = 400
 WARM_UP = 40
 PERIOD_S = 0.025
+REFERENCE = "sine:5deg@0s:0.5Hz"
+"""What the autopilot tracks: a plant that stands still is frozen to its failsafe, and it would hold."""
 LIMIT = 4.0
 U32 = 0xFFFFFFFF
 
@@ -33,7 +41,10 @@ while True:
 
 
 class FakePlant:
-    """Sends samples, on a grid as a plant does, and answers TIMESYNC, over one socket, as system 1, component 25."""
+    """An aircraft on one socket, system 1, component 25: samples on its grid, each command flown, TIMESYNC answered.
+
+    The elevator that comes back within a sample moves it from the next sample on; without an answer it is held.
+    """
 
     def __init__(self) -> None:
         self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -41,6 +52,11 @@ class FakePlant:
         self.mav = dialect.MAVLink(None, 1, 25)
         self.peer: tuple[str, int] | None = None
         self.start = 0.0
+        self.model = load_model("hirm")
+        self.aircraft = LinearAircraft(self.model)
+        self.travel = travel_of(self.model)
+        self.x = np.array(self.model.trim.x)
+        self.u = self.travel.neutral
 
     def pack(self, message: dialect.MAVLink_message) -> bytes:
         frame: bytes = message.pack(self.mav)
@@ -81,14 +97,20 @@ class FakePlant:
         """Send sample k in its time; return the seconds until its own command came, or None when it did not."""
         self.serve(self.start + k * PERIOD_S)
         stamp_us = int((self.start + k * PERIOD_S) * 1e6)
-        attitude = dialect.MAVLink_attitude_message(stamp_us // 1000 & U32, 0.0, 0.01, 0.0, 0.0, 0.001, 0.0)
-        frames = [self.pack(attitude), self.pack(dialect.MAVLink_aoa_ssa_message(stamp_us, 0.5, 0.0))]
+        alpha, q, theta = self.x.tolist()
+        attitude = dialect.MAVLink_attitude_message(stamp_us // 1000 & U32, 0.0, theta, 0.0, 0.0, q, 0.0)
+        aoa = dialect.MAVLink_aoa_ssa_message(stamp_us, math.degrees(alpha), 0.0)
+        frames = [self.pack(attitude), self.pack(aoa)]
+        self.x = self.aircraft.step(self.x, np.array([self.u]), np.zeros(self.model.nw), 0.0)
 
         def answers(message: dialect.MAVLink_message) -> bool:
             if message.get_type() != "SERVO_OUTPUT_RAW":
                 return False
             behind_us = (stamp_us - message.time_usec) & U32  # the stamp is that of either half: ATTITUDE's is in ms
-            return behind_us < 1000
+            if behind_us >= 1000:
+                return False
+            self.u = self.travel.from_pwm(message.servo2_raw) or self.travel.neutral
+            return True
 
         sent = time.perf_counter()
         for frame in frames:
@@ -104,7 +126,17 @@ def measure() -> list[tuple[str, float, float, str]]:
     echo = subprocess.Popen([sys.executable, "-c", ECHO], stdout=subprocess.PIPE, text=True)
     address = f"udpout:127.0.0.1:{plant.socket.getsockname()[1]}"
     autopilot = subprocess.Popen(
-        [sys.executable, "-m", "autopilot", "--plant", address, "--gcs", "udpout:127.0.0.1:9"],
+        [
+            sys.executable,
+            "-m",
+            "autopilot",
+            "--plant",
+            address,
+            "--gcs",
+            "udpout:127.0.0.1:9",
+            "--reference",
+            REFERENCE,
+        ],
         stderr=subprocess.DEVNULL,
     )
     try:

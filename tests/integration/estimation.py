@@ -21,7 +21,7 @@ from autopilot.link.clock import NS_PER_MS, NS_PER_S, NS_PER_US, Clock
 from autopilot.link.node import Record
 from gains.store import load_law
 from sitl.flight import fly_virtual
-from sitl.linkspec import parse_spec
+from sitl.link.spec import parse_spec
 from sitl.scenario import Scenario, load_scenario
 
 __all__ = [

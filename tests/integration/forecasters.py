@@ -22,8 +22,10 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from autopilot.link.clock import NS_PER_MS
-from sitl.impairment import GammaJitter, GilbertElliott, LinkSpec, UniformJitter
-from sitl.linkspec import parse_spec
+from sitl.link.impairment import LinkSpec
+from sitl.link.jitters import GammaJitter, UniformJitter
+from sitl.link.losses import GilbertElliott
+from sitl.link.spec import parse_spec
 from tests.integration.estimation import TS_NS, Bools, Case, Floats, Forecasts, Ints
 
 __all__ = ["best", "by_convolution", "by_table"]

@@ -14,7 +14,7 @@ import pytest
 from autopilot.link.clock import Clock
 from sitl.flight import fly_virtual
 from sitl.flightdata import FlightData
-from sitl.linkspec import parse_link
+from sitl.link.presets import parse_link
 from sitl.recorder import FlightRecorder
 from sitl.scenario import Scenario, load_scenario
 from tests.integration.recursion import deviation, tables

@@ -18,7 +18,7 @@ from gains.model import Schedule
 from gains.store import load_gains, save_gains
 from sitl.flight import fly_virtual
 from sitl.fly import FlightOptions, fly
-from sitl.linkspec import parse_link
+from sitl.link.presets import parse_link
 from sitl.recorder import FlightRecorder
 from sitl.scenario import Scenario, load_scenario
 from tests.integration.programs import program

@@ -18,9 +18,9 @@ from autopilot.link.signing import SIGNATURE_BLOCK_BYTES, Signing
 from autopilot.link.virtual import Participant, VirtualNetwork
 from autopilot.profile import parse_profile
 from sitl.flight import WIRES
-from sitl.linkspec import parse_spec
+from sitl.link.relay import RelayNode
+from sitl.link.spec import parse_spec
 from sitl.plant import PlantNode
-from sitl.relay import RelayNode
 from sitl.scenario import Scenario, load_scenario
 from tests.helpers import S
 

@@ -27,7 +27,7 @@ from autopilot.link.node import Node, Record
 from autopilot.link.virtual import Participant, VirtualNetwork
 from gains.model import Reference
 from sitl.flight import WIRES
-from sitl.linkspec import parse_link
+from sitl.link.presets import parse_link
 from sitl.plant import PlantNode
 from sitl.scenario import Scenario, load_scenario
 

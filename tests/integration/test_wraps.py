@@ -22,7 +22,7 @@ from autopilot.link.node import Record
 from autopilot.link.wire import PLANT, Attitude, NamedValueInt, Timesync, Wire
 from gains.store import load_gains
 from sitl.flight import fly_virtual
-from sitl.linkspec import parse_spec
+from sitl.link.spec import parse_spec
 from sitl.plant import PlantConfig
 from sitl.scenario import Scenario, load_scenario
 from tests.helpers import MS, Flight, S, parse

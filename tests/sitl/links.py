@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from sitl.impairment import Impairment
-from sitl.linkspec import parse_spec
+from sitl.link.impairment import Impairment
+from sitl.link.spec import parse_spec
 
 MS = 1_000_000
 S = 1_000_000_000

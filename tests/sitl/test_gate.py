@@ -27,8 +27,8 @@ from autopilot.link.wire import (
 from gains.table import InputError
 from gains.witnessfile import Witness
 from sitl.flight import fly_virtual
-from sitl.gate import MAX_HISTORY, Gate, Miss, check_flyable
-from sitl.linkspec import parse_spec
+from sitl.link.gate import MAX_HISTORY, Gate, Miss, check_flyable
+from sitl.link.spec import parse_spec
 from sitl.scenario import Scenario, load_scenario
 from tests.helpers import HEARTBEAT, HIRM, MS, TS, S, broken
 

@@ -11,9 +11,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from sitl.impairment import JITTERS, LOSSES, Copy, Fate, GilbertElliott, Impairment, LinkSpec
-from sitl.linkspec import parse_spec
-from sitl.relay import RelayNode
+from sitl.link.impairment import Copy, Fate, Impairment, LinkSpec
+from sitl.link.jitters import JITTERS
+from sitl.link.losses import LOSSES, GilbertElliott
+from sitl.link.relay import RelayNode
+from sitl.link.spec import parse_spec
 from tests.sitl.links import MS, SAMPLES, S, flights_ns, impairment
 
 

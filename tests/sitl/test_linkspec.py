@@ -10,8 +10,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gains.table import InputError
-from sitl.impairment import JITTERS, GammaJitter, GilbertElliott, LinkSpec, NormalJitter, UniformJitter
-from sitl.linkspec import MAX_RATE_BPS, MAX_TIME_NS, PRESETS, format_spec, parse_link, parse_spec
+from sitl.link.impairment import LinkSpec
+from sitl.link.jitters import JITTERS, GammaJitter, NormalJitter, UniformJitter
+from sitl.link.losses import GilbertElliott
+from sitl.link.presets import PRESETS, parse_link
+from sitl.link.spec import MAX_RATE_BPS, MAX_TIME_NS, format_spec, parse_spec
 from tests.sitl.links import MS, S, flights_ns
 
 # ---------------------------------------------------------------------------------------------- grammar

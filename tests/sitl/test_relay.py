@@ -21,11 +21,11 @@ from autopilot.link.wire import (
     Wire,
 )
 from gains.witnessfile import Witness
-from sitl import relay as relay_module
-from sitl.gate import Gate
-from sitl.impairment import LinkSpec
-from sitl.linkspec import parse_spec
-from sitl.relay import MAX_QUEUED, Counters, RelayNode
+from sitl.link import impairment as impairment_module
+from sitl.link.gate import Gate
+from sitl.link.impairment import LinkSpec
+from sitl.link.relay import MAX_QUEUED, Counters, RelayNode
+from sitl.link.spec import parse_spec
 from tests.helpers import HEARTBEAT
 
 MS = 1_000_000
@@ -112,7 +112,7 @@ def conserved(relay: RelayNode) -> bool:
 @given(up=link_specs, down=link_specs, entries=arrivals, seed=st.integers(0, 2**32), limit=st.integers(1, 10))
 def test_every_copy_is_delivered_lost_refused_or_queued_at_every_instant(up, down, entries, seed, limit):
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(relay_module, "MAX_QUEUED", limit)
+        up, down = (replace(spec, limit=limit) for spec in (up, down))
         flight = Flight(up, down, seed)
         for now_ns, port in entries:
             flight.send(port, b"packet", now_ns)

@@ -24,13 +24,10 @@ import numpy as np
 
 from autopilot.link.clock import NS_PER_S
 from autopilot.link.node import Datagram, Record
-from sitl.gate import Gate, GateStep, Miss
-from sitl.impairment import Fate, Impairment, LinkSpec
+from sitl.link.gate import Gate, GateStep, Miss
+from sitl.link.impairment import Fate, Impairment, LinkSpec
 
-__all__ = ["MAX_QUEUED", "Counters", "RelayNode"]
-
-MAX_QUEUED = 10_000
-"""The most copies under way in one direction; more are refused (tail drop)."""
+__all__ = ["Counters", "RelayNode"]
 
 
 @dataclass(slots=True)
@@ -65,6 +62,14 @@ class Counters:
     duplicated: int = 0
     reordered: int = 0
     bytes: int = 0
+
+
+def flip(datagram: bytes, bits: tuple[int, ...]) -> bytes:
+    """Return the datagram with these bits flipped; bit 0 is the lowest of the first byte."""
+    flipped = bytearray(datagram)
+    for bit in bits:
+        flipped[bit >> 3] ^= 1 << (bit & 7)
+    return bytes(flipped)
 
 
 class _Direction:
@@ -150,12 +155,13 @@ class RelayNode:
         counters = direction.counters
         counters.sent += 1
         number = counters.sent
-        copies = direction.impairment.step(len(datagram), now_ns - self._start_ns, MAX_QUEUED - direction.queued)
+        copies = direction.impairment.step(len(datagram), now_ns - self._start_ns, direction.queued)
         counters.duplicated += len(copies) - 1
-        for copy, (fate, exit_link_ns) in enumerate(copies):
+        for copy, (fate, exit_link_ns, flipped) in enumerate(copies):
             exit_ns = self._start_ns + exit_link_ns
             self._sequence += 1
-            packet = _Packet(exit_ns, self._sequence, direction, number, copy, now_ns, fate, datagram)
+            payload = flip(datagram, flipped) if flipped else datagram
+            packet = _Packet(exit_ns, self._sequence, direction, number, copy, now_ns, fate, payload)
             if fate is Fate.DELIVERED or exit_ns > now_ns:
                 direction.queued += 1
                 heappush(self._heap, packet)

@@ -1,0 +1,123 @@
+"""What happens to a link in time, whatever packets it carries: outages, pauses, handovers, fades, slots.
+
+All times are link time, ns from 0. Random ones draw from a stream of their own as time passes, never per packet,
+so that two directions with equal seeds, or a flight with more packets, meet the same interruptions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+__all__ = ["Fading", "Handover", "Slots", "Window"]
+
+
+class Window(NamedTuple):
+    """A stretch of time by schedule, [start, start + length), once or again and again.
+
+    Attributes
+    ----------
+    start_ns, length_ns : int
+        The first one.
+    every_ns : int
+        From one start to the next; 0 for once.
+    """
+
+    start_ns: int
+    length_ns: int
+    every_ns: int = 0
+
+    def end_ns(self, link_ns: int) -> int | None:
+        """Return when the window that covers this instant ends; None where none does."""
+        since_ns = link_ns - self.start_ns
+        if since_ns < 0:
+            return None
+        if self.every_ns:
+            since_ns %= self.every_ns
+        return link_ns - since_ns + self.length_ns if since_ns < self.length_ns else None
+
+
+@dataclass(frozen=True, slots=True)
+class Handover:
+    """A modem that changes its cell: at random instants nothing is sent for a while, and what waited follows at once.
+
+    Interruptions begin as a Poisson process would, counted from the end of the one before.
+
+    Attributes
+    ----------
+    every_ns : int
+        Mean time from the end of one to the beginning of the next, above 0.
+    length_ns : int
+        How long each takes.
+    """
+
+    every_ns: int
+    length_ns: int
+
+    def process(self, rng: np.random.Generator) -> Callable[[int], int]:
+        """Return a function from an instant to when the link sends next; instants must not fall. It owns ``rng``."""
+        start_ns = round(rng.exponential(self.every_ns))
+
+        def resume_ns(link_ns: int) -> int:
+            nonlocal start_ns
+            while link_ns >= start_ns + self.length_ns:
+                start_ns += self.length_ns + round(rng.exponential(self.every_ns))
+            return start_ns + self.length_ns if link_ns >= start_ns else link_ns
+
+        return resume_ns
+
+
+@dataclass(frozen=True, slots=True)
+class Fading:
+    """A radio that is good or bad for exponential times: a Markov chain in continuous time that modulates the delay.
+
+    It begins good. In the long run the share of bad time is B / (G + B), and the autocorrelation of being bad
+    exp(-(1/G + 1/B) lag).
+
+    Attributes
+    ----------
+    good_ns, bad_ns : int
+        Mean length of a good and of a bad time, G and B, above 0.
+    extra_ns : int
+        Delay added to a packet that enters while the radio is bad.
+    loss : float
+        Probability that such a packet is lost, beside any other loss.
+    """
+
+    good_ns: int
+    bad_ns: int
+    extra_ns: int
+    loss: float = 0.0
+
+    def process(self, rng: np.random.Generator) -> Callable[[int], bool]:
+        """Return a function from an instant to whether it is bad; instants must not fall. It owns ``rng``."""
+        is_bad = False
+        end_ns = round(rng.exponential(self.good_ns))
+
+        def bad_at(link_ns: int) -> bool:
+            nonlocal is_bad, end_ns
+            while link_ns >= end_ns:
+                is_bad = not is_bad
+                end_ns += max(1, round(rng.exponential(self.bad_ns if is_bad else self.good_ns)))
+            return is_bad
+
+        return bad_at
+
+
+@dataclass(frozen=True, slots=True)
+class Slots:
+    """A shared channel that may be used at the multiples of a period only: TDMA radios, satellites' frames.
+
+    Attributes
+    ----------
+    period_ns : int
+        From one slot to the next, above 0.
+    packets : int
+        How many packets may begin in one slot; 0 for any number.
+    """
+
+    period_ns: int
+    packets: int = 0
