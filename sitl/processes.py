@@ -278,12 +278,13 @@ class Supervisor:
         return killed
 
     def close(self) -> None:
-        """Kill what still runs and close the sockets."""
+        """Kill what still runs and close the sockets; once more does nothing."""
         for child in self._children.values():
             if child.process.poll() is None:
                 child.process.kill()
                 child.process.wait()
-        for key in list(self._selector.get_map().values()):
+        sockets = self._selector.get_map()  # None once closed
+        for key in list(sockets.values()) if sockets else ():
             assert isinstance(key.fileobj, socket.socket)
             key.fileobj.close()
         self._selector.close()

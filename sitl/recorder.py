@@ -13,6 +13,7 @@ import base64
 import contextlib
 import errno
 import os
+import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Self
@@ -94,7 +95,7 @@ class FlightRecorder:
                 for frame in split_frames(base64.b64decode(record.body["frame"]))[0]:
                     self._tlog.write(frame, time_us)
         elif len(self.kept) < MAX_KEPT:
-            self.kept.append((record.topic, log_time_ns, record.body))
+            self.kept.append((sys.intern(record.topic), log_time_ns, record.body))
         else:
             self.unkept += 1
         if self._mcap is not None:

@@ -59,11 +59,8 @@ def widen(sock: socket.socket, size: int) -> None:
     Its accounting is its own: a small datagram takes hundreds of bytes.
     """
     if sys.platform == "linux":
-        try:
+        with suppress(OSError):  # only root may, and those with CAP_NET_ADMIN
             sock.setsockopt(socket.SOL_SOCKET, SO_RCVBUFFORCE, size)
-        except OSError:  # only root may, and those with CAP_NET_ADMIN
-            pass
-        else:
             return
     with suppress(OSError):  # some systems refuse what Linux cuts to its limit
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, size)

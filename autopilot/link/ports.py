@@ -69,7 +69,7 @@ def parse_address(text: str) -> Address:
     bare = text.removeprefix("udpout:").removeprefix("udpin:")
     host, colon, port = bare.rpartition(":")
     host = host.removeprefix("[").removesuffix("]")
-    if not colon or not host or not port.isascii() or not port.isdigit() or int(port) > 65_535:
+    if not colon or not host or not port.isascii() or not port.isdigit() or len(port) > 5 or int(port) > 65_535:
         raise InputError(f'address "{text}": expected HOST:PORT such as 127.0.0.1:14550')
     return host, int(port)
 

@@ -197,7 +197,7 @@ def test_a_port_has_the_buffer_it_asked_for_or_what_the_kernel_allows(asked):
 
 def test_who_may_not_exceed_the_limit_gets_the_limit():
     class Unprivileged(socket.socket):
-        def setsockopt(self, level, name, value):  # type: ignore[override]
+        def setsockopt(self, level, name, value):
             if name == kernel.SO_RCVBUFFORCE:
                 raise PermissionError
             super().setsockopt(level, name, value)

@@ -389,6 +389,35 @@ def test_a_full_disk_ends_the_tlog_and_is_counted() -> None:
     assert log.error == "/dev/full: No space left on device"
 
 
+def test_a_tlog_of_few_frames_reaches_the_file_within_half_a_second(tmp_path: Path) -> None:
+    path = tmp_path / "flight.tlog"
+    (frame,) = attitude_frames(1)
+    with TlogWriter(path) as log:
+        for k in range(40):
+            log.write(frame, 7_000_000 + 100_000 * k)  # ten per second
+            assert path.stat().st_size == (k + 1) // 6 * 6 * (8 + len(frame))
+
+
+@pytest.mark.parametrize("kind", ["mcap", "tlog"])
+def test_a_disk_filled_on_demand_takes_nothing_more(tmp_path: Path, kind: str) -> None:
+    path = tmp_path / f"flight.{kind}"
+    recorder: McapRecorder | TlogWriter = McapRecorder(path, {}) if kind == "mcap" else TlogWriter(path)
+    for filled in (False, True):
+        for k in range(100):
+            if isinstance(recorder, McapRecorder):
+                recorder.write(sample_records(k)[0], k * PERIOD_NS)
+            else:
+                recorder.write(b"frame", k)
+        if not filled:
+            recorder.fill_disk()
+            size = path.stat().st_size
+    recorder.close()
+    assert path.stat().st_size == size > 0
+    assert recorder.error == f"{path}: No space left on device"
+    saved = len(salvage(path)) if kind == "mcap" else size // len(b"12345678frame")
+    assert saved + recorder.lost == 200
+
+
 # --- lines
 
 json_values = st.recursive(

@@ -12,6 +12,7 @@ import pytest
 
 from autopilot.link import stream as stream_module
 from autopilot.link.node import Record
+from autopilot.link.orders import BreakSends, StepClock, encode_order
 from autopilot.link.record import decode_line
 from autopilot.link.stream import TOKEN_VARIABLE, StreamSink, encode_hello
 from gains.table import InputError
@@ -119,6 +120,51 @@ def test_a_recorder_that_dies_with_data_under_way_ends_the_process_too(server):
         sink.pump()
     assert sink.closed
     sink.close()
+
+
+def hear(sink: StreamSink) -> None:
+    select.select([sink._socket], [], [], TIMEOUT_S)
+    sink.pump()
+
+
+def test_orders_are_heard_whole_in_order_and_once(server):
+    sink, accepted = connect(server)
+    with closing(accepted):
+        assert sink.orders() == []
+        first, second = encode_order(StepClock(-7)), encode_order(BreakSends(9))
+        accepted.sendall(first + second[:10])
+        hear(sink)
+        assert sink.orders() == [StepClock(-7)]
+        assert sink.orders() == []
+        accepted.sendall(second[10:])
+        hear(sink)
+        assert sink.orders() == [BreakSends(9)]
+        assert not sink.closed
+        sink.close()
+
+
+@pytest.mark.parametrize("said", [b'{"order": "land"}\n', b"x" * (stream_module.MAX_HEARD_BYTES + 1)])
+def test_what_is_no_order_ends_the_stream(server, said):
+    sink, accepted = connect(server)
+    with closing(accepted):
+        accepted.sendall(said)
+        while not sink.closed:
+            hear(sink)
+            assert sink.orders() == []
+        sink.close()
+
+
+def test_orders_are_heard_while_the_recorder_takes_nothing(server, monkeypatch):
+    monkeypatch.setattr(stream_module, "DRAIN_TIMEOUT_S", 0.05)
+    sink, accepted = connect(server)
+    with closing(accepted):
+        while len(sink._buffer) < 1 << 20:
+            sink.write(record(1), 1)
+            sink.pump()
+        accepted.sendall(encode_order(StepClock(1)))
+        hear(sink)
+        assert sink.orders() == [StepClock(1)]
+        sink.close()
 
 
 def test_nobody_listening_is_refused_by_address(server):

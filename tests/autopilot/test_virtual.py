@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from autopilot.link.clock import Clock
 from autopilot.link.node import Record
-from autopilot.link.virtual import Participant, VirtualNetwork
+from autopilot.link.virtual import Loss, Participant, VirtualNetwork
 from tests.helpers import AUTOPILOT_CLOCK, MS, PLANT_CLOCK, Flight, S, constant
 
 quick = settings(deadline=None)
@@ -191,6 +191,127 @@ def test_a_replaced_node_boots_on_its_new_clock_and_takes_what_is_under_way():
     fly(net)
     assert log[1:] == [("receive", "b", "in", b"late", 500), ("tick", "b", 507)]
     assert net.now_ns == S
+
+
+# what may happen to a node
+
+
+def pair(log, a_deadlines=(), b_deadlines=(), max_waiting=256):
+    """Return a network in which a sends b its number at each of its deadlines, 10 ns apart."""
+    a = Ticker("a", log, list(a_deadlines), [("out", b"x")])
+    b = Ticker("b", log, list(b_deadlines))
+    people = [Participant("a", a, Clock()), Participant("b", b, Clock(), max_waiting)]
+    return VirtualNetwork(people, {("a", "out"): ("b", "in")})
+
+
+def of(log, name):
+    return [(entry[0], entry[-1]) for entry in log if entry[1] == name]
+
+
+def test_a_dead_node_does_nothing_and_what_is_for_it_is_lost():
+    log = []
+    net = pair(log, [10, 20, 30], [15, 25])
+    fly(net, 12)
+    net.kill("b")
+    fly(net, 100)
+    assert of(log, "b") == [("receive", 10)]
+    assert net.losses["b"] == {Loss.DEAD: 2}
+
+
+def test_what_waits_for_a_node_dies_with_it_and_a_new_one_lives():
+    log = []
+    net = pair(log, [10, 20, 30])
+    net.freeze("b")
+    fly(net, 15)
+    net.kill("b")
+    fly(net, 25)
+    net.replace("b", Ticker("b", log, [7]), Clock(0, 0, 25))
+    fly(net, 100)
+    assert net.losses["b"] == {Loss.DEAD: 2}
+    assert of(log, "b") == [("receive", 5), ("tick", 7)]
+
+
+def test_a_frozen_node_takes_all_that_waits_when_it_thaws_and_then_ticks_once():
+    log = []
+    net = pair(log, [10, 20, 30], [15])
+    net.freeze("b")
+    fly(net, 25)
+    assert of(log, "b") == []
+    net.thaw("b")
+    fly(net, 100)
+    assert of(log, "b") == [("receive", 25), ("receive", 25), ("tick", 25), ("receive", 30)]
+    assert not net.losses["b"]
+
+
+def test_no_more_waits_for_a_frozen_node_than_there_is_room_for():
+    log = []
+    net = pair(log, [10, 20, 30, 40, 50], max_waiting=2)
+    net.freeze("b")
+    fly(net, 45)
+    net.thaw("b")
+    fly(net, 100)
+    assert of(log, "b") == [("receive", 45), ("receive", 45), ("receive", 50)]
+    assert net.losses["b"] == {Loss.OVERFLOW: 2}
+
+
+def test_a_mute_node_hears_and_ticks_and_what_it_sends_is_lost():
+    log = []
+    net = pair(log, [10, 20, 30])
+    fly(net, 15)
+    net.mute("a", True)
+    fly(net, 25)
+    net.mute("a", False)
+    fly(net, 100)
+    assert of(log, "a") == [("tick", 10), ("tick", 20), ("tick", 30)]
+    assert of(log, "b") == [("receive", 10), ("receive", 30)]
+    assert net.losses["a"] == {Loss.MUTE: 1}
+
+
+def test_a_muted_send_is_on_no_wire_and_in_no_tap():
+    log, seen = [], []
+    a = Ticker("a", log, [5, 6], [("out", b"x")])
+    net = network(log, a, tap=lambda *what: seen.append(what[-1]), tapped=["a"])
+    fly(net, 5)
+    net.mute("a", True)
+    fly(net, 10)
+    assert seen == [5]
+
+
+@pytest.mark.parametrize("by_ns", [-30, 30])
+def test_a_clock_that_steps_moves_the_deadlines_of_its_node_only(by_ns):
+    log = []
+    net = pair(log, [100], [100])
+    fly(net, 50)
+    net.step_clock("b", by_ns)
+    fly(net, 200)
+    assert net.clock("b").node_ns(60) == 60 + by_ns
+    assert of(log, "a") == [("tick", 100)]
+    assert [entry for entry in log if entry[1] == "b" and entry[0] == "tick"] == [("tick", "b", 100)]
+    order = [entry[1] for entry in log if entry[0] == "tick"]
+    assert order == (["b", "a"] if by_ns > 0 else ["a", "b"])
+
+
+def test_a_clock_of_another_rate_goes_on_from_what_it_shows():
+    log = []
+    a = Ticker("a", log, [2 * S])
+    net = network(log, a, clocks=[Clock(0, 0)])
+    fly(net, S)
+    net.drift_clock("a", 200_000)
+    assert net.clock("a").node_ns(S) == S
+    assert net.clock("a").node_ns(2 * S) == 2 * S + 200_000
+    fly(net, 2 * S - 199_960)
+    assert of(log, "a") == [("tick", 2 * S)]
+
+
+def test_a_clock_that_steps_back_past_a_deadline_makes_it_wait_again():
+    log = []
+    net = pair(log, [], [100, 110])
+    fly(net, 105)
+    net.step_clock("b", -50)
+    fly(net, 159)
+    assert of(log, "b") == [("tick", 100)]
+    fly(net, 160)
+    assert of(log, "b") == [("tick", 100), ("tick", 110)]
 
 
 @pytest.mark.parametrize("seconds", [3])

@@ -6,9 +6,9 @@ write first. What is asked of each packet comes from the relay's own seeded mode
 packet came is the kernel's stamp, so that the receiver's own waking is in none of the numbers.
 
 The medians are compared with the echo's transit. For the slowest packets that would be unfair: the host of a virtual
-machine may take a processor away for milliseconds, which an echo hardly shows, since who sends is stopped as well, while
-a packet that should leave meanwhile is late. So their yardstick is the echo's time since the packet should have been
-sent: what the machine does to a timer and an echo.
+machine may take a processor away for milliseconds, which an echo hardly shows, since who sends is stopped as well,
+while a packet that should leave meanwhile is late. So their yardstick is the echo's time since the packet should have
+been sent: what the machine does to a timer and an echo.
 
 The rate is one way and without delay, from a process of its own on the last processor, while the relays keep to the
 first; the receiver empties its buffer now and then. A relay's processor time is what the system charges it.
@@ -127,7 +127,7 @@ class Naive(asyncio.DatagramProtocol):
     def __init__(self, far: int) -> None:
         self.far = (HOME, far)
 
-    def connection_made(self, transport: asyncio.DatagramTransport) -> None:  # type: ignore[override]
+    def connection_made(self, transport: asyncio.DatagramTransport) -> None:
         self.transport = transport
         self.loop = asyncio.get_running_loop()
 

@@ -85,13 +85,13 @@ faults = st.one_of(
 )
 
 
-@settings(deadline=None)
+@settings(deadline=None, max_examples=60)
 @given(faults)
 def test_every_fault_survives_being_written_and_read(fault: Fault) -> None:
     assert parse_fault(format_fault(fault)) == fault
 
 
-@settings(deadline=None)
+@settings(deadline=None, max_examples=60)
 @given(st.one_of(st.text(max_size=40), st.from_regex(r"[a-z]{4,8}:[a-z:.0-9-]{0,12}@[-+.0-9ms]{0,12}", fullmatch=True)))
 def test_any_text_is_a_fault_or_refused_in_one_line(text: str) -> None:
     try:

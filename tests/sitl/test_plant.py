@@ -25,6 +25,7 @@ from autopilot.link.wire import (
 from gains.model import Actuator, Trim
 from gains.store import load_model
 from sitl.aircraft.disturbance import HarmonicGust, SquareDelta
+from sitl.faults import parse_fault
 from sitl.plant import DIVERGED, MAX_CATCH_UP, MAX_COMMANDS, PlantConfig, PlantNode, Refusal
 from tests.helpers import HEARTBEAT, HIRM, MS, TS, S, broken, parse
 
@@ -546,6 +547,103 @@ def test_records_keep_their_schema():
     b.samples(4, 20)
     for record in b.made:
         assert set(record.body) == set(SCHEMAS[record.topic]["required"])
+
+
+# faults
+
+
+def faulty(*texts: str, samples: int = 40, **config) -> Bench:
+    """Return a plant with faults after some samples, flown with a command that moves from sample to sample."""
+    b = bench(x0=np.array([0.01, 0.1, 0.02]), faults=tuple(map(parse_fault, texts)), **config)
+    for k in range(samples):
+        b.samples(k, k)
+        b.command(k, 0.1 * math.sin(0.5 * k), T0 + k * TS + 1)
+    return b
+
+
+def pitches(b: Bench) -> list:
+    return [m.pitch for m in b.of("ATTITUDE")]
+
+
+HEALTHY = faulty()
+TRUE = np.array([t["x"][2] for t in HEALTHY.truth])
+
+
+def test_a_frozen_sensor_repeats_what_it_said_last_from_the_first_sample_in_the_fault_to_the_last():
+    b = faulty("sensor:theta_rad:frozen@250ms+250ms")  # samples 10 to 19
+    expected = [*TRUE[:10], *[TRUE[9]] * 10, *TRUE[20:]]
+    assert pitches(b) == pytest.approx(expected, abs=1e-7)
+
+
+def test_a_fault_that_begins_and_ends_between_samples_takes_those_inside():
+    b = faulty("sensor:theta_rad:bias:0.5@251ms+249.000001ms")  # after sample 10, just past sample 20
+    assert np.flatnonzero(np.abs(pitches(b) - TRUE) > 0.1).tolist() == list(range(11, 21))
+
+
+def test_a_sensor_frozen_from_the_beginning_repeats_its_first_value():
+    assert pitches(faulty("sensor:theta_rad:frozen@0s")) == pytest.approx([TRUE[0]] * 40, abs=1e-7)
+
+
+def test_a_bias_adds_in_the_unit_of_the_state_and_noise_is_gaussian_and_of_the_seed():
+    b = faulty("sensor:alpha_rad:bias:0.02@0s")
+    air = [math.radians(m.AOA) for m in b.of("AOA_SSA")]
+    assert air == pytest.approx([t["x"][0] + 0.02 for t in b.truth], abs=1e-7)
+    one, same, other = (faulty("sensor:theta_rad:noise:0.1@0s", samples=400, seed=seed) for seed in (1, 1, 2))
+    noise = np.array(pitches(one)) - [t["x"][2] for t in one.truth]
+    assert pitches(one) == pitches(same)
+    assert pitches(one) != pitches(other)
+    assert abs(noise.mean()) < 4 * 0.1 / math.sqrt(400)
+    assert 0.4 * 0.8 < np.mean(np.abs(noise) > 0.067) < 0.6 * 1.1  # half of N(0, s²) lies within 0.674 s
+
+
+def test_one_more_fault_does_not_change_the_noise_of_another():
+    alone = faulty("sensor:theta_rad:noise:0.1@0s")
+    together = faulty("sensor:theta_rad:noise:0.1@0s", "sensor:q_rad_s:noise:0.1@0s")
+    assert pitches(alone) == pitches(together)
+
+
+def test_a_sensor_that_says_nan_says_it_in_its_field_only():
+    b = faulty("sensor:theta_rad:nan@250ms+250ms")
+    assert [k for k, m in enumerate(b.of("ATTITUDE")) if math.isnan(m.pitch)] == list(range(10, 20))
+    assert [m.pitchspeed for m in b.of("ATTITUDE")] == [m.pitchspeed for m in HEALTHY.of("ATTITUDE")]
+    assert [(m.alt, m.climb) for m in b.of("VFR_HUD")] == [(m.alt, m.climb) for m in HEALTHY.of("VFR_HUD")]
+
+
+def test_what_sensors_say_does_not_change_the_truth():
+    b = faulty("sensor:theta_rad:nan@0s", "sensor:q_rad_s:bias:3@0s", "sensor:alpha_rad:noise:1@0s")
+    assert b.truth == HEALTHY.truth
+
+
+def positions(b: Bench) -> np.ndarray:
+    return np.array([t["u"][0] for t in b.truth])
+
+
+def test_a_stuck_elevator_stays_where_it_is_and_the_record_says_so():
+    b, free = positions(faulty("elevator:stuck@250ms+250ms")), positions(HEALTHY)
+    assert b[10:20].tolist() == [free[9]] * 10
+    assert [*b[:10], *b[20:]] == [*free[:10], *free[20:]]
+
+
+def test_a_slow_elevator_is_limited_in_its_rate():
+    b, free = positions(faulty("elevator:slow:0.5@0s")), positions(HEALTHY)
+    steps = np.abs(np.diff(b))
+    assert steps.max() == pytest.approx(0.5 * MODEL.Ts, rel=1e-12)
+    assert np.abs(np.diff(free)).max() > 2 * steps.max()
+
+
+def test_a_slow_elevator_is_no_faster_than_its_model():
+    limits = Actuator(MODEL.actuator.low, MODEL.actuator.high, rate=np.array([0.2]))
+    b = faulty("elevator:slow:0.5@0s", model=replace(MODEL, actuator=limits))
+    assert np.abs(np.diff(positions(b))).max() == pytest.approx(0.2 * MODEL.Ts, rel=1e-12)
+
+
+def test_a_reversed_elevator_goes_as_far_to_the_other_side_of_neutral():
+    trim = Trim(np.zeros(3), np.array([-0.02]))
+    straight = faulty(model=replace(MODEL, trim=trim))
+    b = faulty("elevator:reversed@250ms", model=replace(MODEL, trim=trim))
+    assert positions(b)[:10].tolist() == positions(straight)[:10].tolist()
+    assert positions(b)[10:] + 0.02 == pytest.approx(-(positions(straight)[10:] + 0.02), abs=1e-15)
+    assert np.abs(positions(b)[10:] + 0.02).max() > 0.05
 
 
 # hostile datagrams

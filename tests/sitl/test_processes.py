@@ -33,11 +33,11 @@ CHILD = """
         sys.exit(f"{name}: error: no good")
     if "mute" in sys.argv:
         time.sleep(60)
+    print(f"{name} began", file=sys.stderr, flush=True)
     host, port = sys.argv[-1].rsplit(":", 1)
     stream = socket.create_connection((host, int(port)))
     hello = {"hello": name, "token": os.environ["LAGPROOF_STREAM_TOKEN"], "ports": ports}
     stream.sendall(json.dumps(hello).encode() + b"\\n")
-    print(f"{name} began", file=sys.stderr, flush=True)
     n = 0
     while True:
         heard = b""

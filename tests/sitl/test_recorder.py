@@ -5,11 +5,12 @@ from __future__ import annotations
 import json
 import os
 import resource
+import socket
 import subprocess
 import sys
 from collections import Counter
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import replace
 from io import StringIO
 from pathlib import Path
@@ -18,7 +19,8 @@ import pytest
 from rich.console import Console
 
 from autopilot.link.node import Record
-from autopilot.link.record import read_mcap
+from autopilot.link.record import encode_line, read_mcap
+from autopilot.link.stream import StreamSink
 from gains.table import InputError
 from sitl.flight import fly_virtual
 from sitl.fly import FlightOptions, fly
@@ -142,6 +144,35 @@ def test_a_flight_whose_disk_fills_up_ends_with_a_verdict_and_says_what_is_missi
     assert "plot" not in outcome.summary["files"]
     assert not (tmp_path / "flight.png").exists()
     assert json.loads((tmp_path / "summary.json").read_bytes()) == outcome.summary
+
+
+def test_a_recorder_that_stands_still_gets_ten_seconds_of_flight_later_and_what_it_cannot_get_is_counted(flown):
+    """The sink alone: nobody reads for ten seconds, then for as long as its buffer takes, and then all of it."""
+    lines = [encode_line(record, at_ns) for record, at_ns in flown]
+    span_s = (flown[-1][1] - flown[0][1]) / 1e9
+    with closing(socket.create_server(("127.0.0.1", 0))) as server:
+        sink = StreamSink(server.getsockname(), "plant", {})
+        accepted, _ = server.accept()
+        written = 0
+        while sink.lost < 1000:
+            for record, at_ns in flown:
+                sink.write(record, at_ns)
+                sink.pump()
+            written += len(flown)
+            if written / len(flown) * span_s <= 10.0:
+                assert sink.lost == 0
+        received = bytearray()
+        accepted.settimeout(10.0)
+        while not sink.closed and sink._buffer:
+            received += accepted.recv(1 << 20)
+            sink.pump()
+        sink.close()
+        with closing(accepted):
+            while part := accepted.recv(1 << 20):
+                received += part
+    found = bytes(received).splitlines(keepends=True)[1:]
+    assert len(found) + sink.lost == written
+    assert found[: len(lines)] == lines
 
 
 @pytest.mark.long

@@ -21,10 +21,9 @@ from autopilot.link.wire import (
     Wire,
 )
 from gains.witnessfile import Witness
-from sitl.link import impairment as impairment_module
 from sitl.link.gate import Gate
-from sitl.link.impairment import LinkSpec
-from sitl.link.relay import MAX_QUEUED, Counters, RelayNode
+from sitl.link.impairment import MAX_QUEUED, LinkSpec
+from sitl.link.relay import Counters, RelayNode
 from sitl.link.spec import parse_spec
 from tests.helpers import HEARTBEAT
 
@@ -111,14 +110,13 @@ def conserved(relay: RelayNode) -> bool:
 
 @given(up=link_specs, down=link_specs, entries=arrivals, seed=st.integers(0, 2**32), limit=st.integers(1, 10))
 def test_every_copy_is_delivered_lost_refused_or_queued_at_every_instant(up, down, entries, seed, limit):
-    with pytest.MonkeyPatch.context() as patch:
-        up, down = (replace(spec, limit=limit) for spec in (up, down))
-        flight = Flight(up, down, seed)
-        for now_ns, port in entries:
-            flight.send(port, b"packet", now_ns)
-            assert conserved(flight.relay)
-            assert max(flight.relay.queued.values()) <= limit
-        flight.finish()
+    up, down = (replace(spec, limit=limit) for spec in (up, down))
+    flight = Flight(up, down, seed)
+    for now_ns, port in entries:
+        flight.send(port, b"packet", now_ns)
+        assert conserved(flight.relay)
+        assert max(flight.relay.queued.values()) <= limit
+    flight.finish()
     assert conserved(flight.relay)
     assert flight.relay.queued == {"up": 0, "down": 0}
 
@@ -390,18 +388,16 @@ def test_a_full_queue_refuses_the_newest_and_leaves_the_other_direction_alone():
     assert [int.from_bytes(p, "big") for _, p in relay.outgoing()] == list(range(MAX_QUEUED))
 
 
-def test_packets_due_at_the_instant_of_an_arrival_make_room_for_it(monkeypatch):
-    monkeypatch.setattr(relay_module, "MAX_QUEUED", 1)
-    relay = RelayNode(parse_spec("delay=5ms"), PERFECT, 1)
+def test_packets_due_at_the_instant_of_an_arrival_make_room_for_it():
+    relay = RelayNode(parse_spec("delay=5ms,limit=1"), PERFECT, 1)
     relay.receive("plant", b"a", 0)
     relay.receive("plant", b"b", 5 * MS)  # a delivery comes before the tick of its instant
     assert relay.counters["up"].refused == 0
     assert relay.outgoing() == [("autopilot", b"a")]
 
 
-def test_an_overloaded_serialiser_recovers_as_soon_as_its_queue_is_through(monkeypatch):
-    monkeypatch.setattr(relay_module, "MAX_QUEUED", 10)
-    relay = RelayNode(parse_spec("rate=80kbps"), PERFECT, 1)
+def test_an_overloaded_serialiser_recovers_as_soon_as_its_queue_is_through():
+    relay = RelayNode(parse_spec("rate=80kbps,limit=10"), PERFECT, 1)
     for _ in range(1000):
         relay.receive("plant", bytes(50), 0)
     assert asdict(relay.counters["up"])["refused"] == 990

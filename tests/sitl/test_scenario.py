@@ -5,9 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from click.testing import CliRunner
 
 from gains.table import InputError
 from gains.witnessfile import Witness, read_witness, write_witness
+from sitl.__main__ import cli
+from sitl.faults import format_fault, parse_fault
 from sitl.scenario import Scenario, autopilot_arguments, load_scenario, plant_arguments, relay_arguments
 
 FIFO = Witness("hirm-paper", "hirm", 0.025, 1, 3, "fifo", 1.01, (1, 2, 3))
@@ -108,3 +111,58 @@ def test_the_stored_witnesses_are_of_the_gains_and_the_model_they_fly_with(name:
     assert scenario.plant_name == scenario.gains.model.name
     assert scenario.witness.d_max == scenario.gains.d_max + 1
     assert scenario.witness.growth_per_sample > 1.0
+
+
+# faults
+
+FAULTS = 'faults = ["kill:relay@0.2s+0.1s", "sensor:q_rad_s:noise:0.01@0.1s", "elevator:slow:0.5@0.5s+0.5s"]'
+
+
+def test_faults_are_read_in_their_order_and_the_plant_gets_its_own(tmp_path: Path) -> None:
+    scenario = load(tmp_path, top=FAULTS + "\nseed = 7", rest="[variant.same]\n[variant.calm]\nfaults = []\n")
+    assert [format_fault(fault).partition(":")[0] for fault in scenario.faults] == ["kill", "sensor", "elevator"]
+    config = scenario.plant_node().config
+    assert (config.faults, config.seed) == (scenario.faults[1:], 7)
+    arguments = plant_arguments(scenario)
+    given = [arguments[i + 1] for i, word in enumerate(arguments) if word == "--fault"]
+    assert [parse_fault(text) for text in given] == list(scenario.faults[1:])
+    assert arguments[arguments.index("--seed") + 1] == "7"
+    assert {name: variant.faults for name, variant in scenario.variants.items()} == {
+        "same": scenario.faults,
+        "calm": (),
+    }
+
+
+def test_a_plant_without_faults_is_started_as_ever() -> None:
+    assert not {"--fault", "--seed"} & set(plant_arguments(load_scenario("nominal")))
+
+
+@pytest.mark.parametrize(
+    ("fault", "complaint"),
+    [
+        ("kill:gcs@0.1s", "expected kill:P"),
+        ("sensor:beta_rad:nan@0.1s", "expected a state of alpha_rad, q_rad_s, theta_rad"),
+        ("kill:plant@2s", "expected it within the flight of 1s"),
+    ],
+)
+def test_a_scenario_with_an_impossible_fault_is_refused(tmp_path: Path, fault: str, complaint: str) -> None:
+    with pytest.raises(InputError, match=complaint):
+        load(tmp_path, top=f'faults = ["{fault}"]')
+    with pytest.raises(InputError, match=complaint):
+        load(tmp_path, rest=f'[variant.v]\nfaults = ["{fault}"]')
+
+
+@pytest.mark.parametrize(
+    ("arguments", "complaint"),
+    [
+        (["plant", "--fault", "kill:plant@1s"], "expected sensor:... or elevator:..."),
+        (["plant", "--fault", "sensor:beta:nan@1s"], "expected a state of alpha_rad"),
+        (["fly", "--virtual", "--fault", "elevator:gone@1s"], "expected kill:P"),
+        (["fly", "--virtual", "--fault", "kill:plant@60s"], "expected it within the flight of 10s"),
+        (["fly", "--virtual", "--duration", "2", "--fault", "kill:plant@3s"], "expected it within the flight of 2s"),
+    ],
+)
+def test_the_programs_refuse_faults_that_cannot_be(arguments: list[str], complaint: str) -> None:
+    result = CliRunner().invoke(cli, arguments)
+    assert isinstance(result.exception, InputError)
+    assert complaint in str(result.exception)
