@@ -26,7 +26,8 @@ fly: setup
 	$(BIN)/sitl fly $(FLIGHT)
 
 test: setup
-	$(BIN)/pytest -m "not long"
+	$(BIN)/pytest -m "not long and not realtime" -n auto --dist loadfile
+	$(BIN)/pytest -m "realtime and not long" tests/integration
 
 check: setup
 	$(BIN)/ruff format --check

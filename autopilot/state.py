@@ -41,6 +41,9 @@ NUMBER_WAIT_NS = 5 * NS_PER_S // 2
 JUMP_BACK_NS = NS_PER_S
 """A stamp older than the newest by more than this is no reordering but, with a clock step, a restart."""
 
+OVERTAKEN_NS = 250_000_000
+"""A sample's number may come behind its sample, and be overtaken by samples of so long."""
+
 FUTURE_SLACK_NS = NS_PER_S
 """A stamp may be later than the plant's time by this much, beyond the bound of the clock estimate."""
 
@@ -316,7 +319,7 @@ class SampleAssembler:
         if self._last_j is None or self.newest_ns is None:
             return False
         if self._number is None:  # the clock has stepped: stamps from before it count nothing
-            if k <= self._last_j:
+            if k < self._last_j - OVERTAKEN_NS // self._Ts_ns:
                 self.lost = "plant restarted"
         elif max(k, self._count((k, at_ns), self.newest_ns)) < self._last_j - self._slip:
             self.lost = "sample numbers fell back"

@@ -32,8 +32,10 @@ from sitl.link.gate import Gate, check_flyable
 from sitl.link.presets import PRESETS, parse_link
 from sitl.link.relay import RelayNode
 from sitl.link.spec import parse_spec
+from sitl.linkcommands import links
 from sitl.plant import DEFAULT_SERVO_TIMEOUT, PlantConfig, PlantNode
 from sitl.processes import FlightFailed
+from sitl.rescuecommand import recover_command
 from sitl.scenario import MAX_SEED, Scenario, load_scenario, stored_scenarios
 from sitl.summary import summary_table
 
@@ -356,6 +358,10 @@ def _print_pairs(pairs: Sequence[tuple[str, str]]) -> None:
     width = max(len(name) for name, _ in pairs)
     for name, text in pairs:
         click.echo(f"{name:<{width}}  {text}")
+
+
+for command in (links, recover_command):
+    cli.add_command(command)
 
 
 def main() -> None:

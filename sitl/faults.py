@@ -24,10 +24,11 @@ in the plant (sensor, elevator), or with whoever runs the programs: :mod:`sitl.f
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from decimal import Decimal
 from enum import StrEnum
+from typing import Any
 
 from autopilot.link.clock import NS_PER_MS, NS_PER_S
 from autopilot.link.node import Record
@@ -54,6 +55,7 @@ __all__ = [
     "aircraft_faults",
     "check_faults",
     "fault_changes",
+    "fault_of",
     "fault_record",
     "format_fault",
     "parse_fault",
@@ -402,3 +404,13 @@ def fault_record(change: FaultChange, t_ns: int, **data: object) -> Record:
         "data": {"fault": text, "phase": change.phase.value, **data},
     }
     return Record("events", t_ns, body)
+
+
+def fault_of(event: Mapping[str, Any]) -> tuple[Fault, Phase] | None:
+    """Return what an event of a recording, of whatever origin, tells of a fault; None where it tells of none."""
+    if event["kind"] != "fault" or event["node"] != "scenario":
+        return None
+    try:
+        return parse_fault(str(event["data"].get("fault"))), Phase(event["data"].get("phase"))
+    except (InputError, ValueError):
+        return None

@@ -19,7 +19,7 @@ from autopilot.failsafe import Mode
 from autopilot.profile import parse_profile
 from gains.model import Matrix, Model
 from gains.table import InputError
-from sitl.faults import CorruptGains, Kill, Phase, parse_fault, program_of
+from sitl.faults import CorruptGains, Kill, Phase, fault_of, program_of
 from sitl.link.impairment import Fate
 
 __all__ = ["FlightData", "FlightEvent", "LinkPackets", "ModeInterval"]
@@ -241,7 +241,7 @@ class _Collected:
                 self.events.append((log_time_ns, body))
                 if body["kind"] == "failsafe":
                     self.modes.append((log_time_ns, body["data"]["to"]))
-                elif body["kind"] == "fault" and _kills_autopilot(body["data"]):
+                elif _kills_autopilot(body):
                     self.modes.append((log_time_ns, Mode.STANDBY.value))
 
     def _add_truth(self, log_time_ns: int, body: Mapping[str, Any]) -> None:
@@ -301,12 +301,11 @@ class _Collected:
         return LinkPackets(entered_s, np.where(arrived, (left_ns - sent_ns) / 1e9, np.nan))
 
 
-def _kills_autopilot(data: Mapping[str, Any]) -> bool:
+def _kills_autopilot(event: Mapping[str, Any]) -> bool:
     """Return whether an event tells that a fault has killed the autopilot."""
-    if data["phase"] != Phase.BEGIN:
-        return False
-    fault = parse_fault(data["fault"])
-    return isinstance(fault, Kill | CorruptGains) and program_of(fault) == "autopilot"
+    fault, phase = fault_of(event) or (None, None)
+    dead = isinstance(fault, Kill | CorruptGains) and program_of(fault) == "autopilot"
+    return dead and phase is Phase.BEGIN
 
 
 def _offsets_ns(seen_ns: NDArray[np.int64], arrived: NDArray[np.bool_]) -> NDArray[np.int64]:

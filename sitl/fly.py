@@ -206,8 +206,8 @@ def _fly_in_processes(
     progress = _Progress(scenario.samples, scenario.plant.Ts_ns, bool(scenario.faults))
 
     def write(record: Record, at_ns: int) -> None:
-        if at_ns > progress.end_ns:
-            return  # flown while the programs were being told to end
+        if at_ns > progress.end_ns and record.body.get("kind") != "ports":
+            return  # flown while the programs were being told to end; what they could not record they tell last
         if record.topic == "plant/truth":
             progress.take(record.body, at_ns)
         log_time_ns = max(0, at_ns - start_ns)

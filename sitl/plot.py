@@ -121,6 +121,13 @@ def _control_quantity(model: Model) -> _Quantity:
     return _Quantity("u", "", 1.0)
 
 
+def _curve(flight: FlightData, values: Matrix) -> tuple[Matrix, Matrix]:
+    """Return times and values of the samples, with a nan where samples are missing: a dead plant draws no line."""
+    Ts = flight.model.Ts
+    (last,) = np.nonzero(np.diff(flight.time_s) > 1.5 * Ts)
+    return np.insert(flight.time_s, last + 1, flight.time_s[last] + Ts), np.insert(values, last + 1, np.nan)
+
+
 def _draw_output(panel: Axes, flight: FlightData) -> None:
     quantities = _output_quantities(flight.model)
     for i, quantity in enumerate(quantities):
@@ -128,10 +135,9 @@ def _draw_output(panel: Axes, flight: FlightData) -> None:
         if flight.model.reference is not None:
             target = quantity.scale * flight.reference[:, i]
             name = f"reference {quantity.name}r"
-            panel.plot(flight.time_s, target, color=_BLACK, linewidth=1.1, linestyle="--", label=name)
+            panel.plot(*_curve(flight, target), color=_BLACK, linewidth=1.1, linestyle="--", label=name)
         panel.plot(
-            flight.time_s,
-            quantity.scale * flight.output[:, i],
+            *_curve(flight, quantity.scale * flight.output[:, i]),
             color=colour,
             linewidth=1.5,
             label=quantity.name,
@@ -146,7 +152,7 @@ def _draw_control(panel: Axes, flight: FlightData) -> None:
         u = quantity.scale * flight.u[:, i]
         name = quantity.name if flight.model.nu == 1 else f"{quantity.name} {i + 1}"
         colour = _OUTPUT_COLOURS[i % len(_OUTPUT_COLOURS)]
-        panel.step(flight.time_s, u, where="post", color=colour, linewidth=1.2, label=name)
+        panel.step(*_curve(flight, u), where="post", color=colour, linewidth=1.2, label=name)
         if actuator is None or actuator.low is None or actuator.high is None:
             continue
         low, high = quantity.scale * float(actuator.low[i]), quantity.scale * float(actuator.high[i])
@@ -177,7 +183,7 @@ def _draw_delay(panel: Axes, flight: FlightData) -> None:
     if known.any():
         applied_s = (flight.command_s + flight.model.Ts * (flight.forecast + 0.5))[known]
         panel.plot(applied_s, flight.forecast[known], ".", color=_VERMILLION, markersize=4.5, label="forecast d")
-    panel.step(flight.time_s, flight.d, where="post", color=_BLACK, linewidth=0.9, label="true d(k)")
+    panel.step(*_curve(flight, flight.d), where="post", color=_BLACK, linewidth=0.9, label="true d(k)")
     for n, bound in enumerate(window):
         label = "d_min, d_max" if n == 0 else None
         panel.axhline(bound, color=_GREEN, linewidth=1.1, linestyle="--", label=label)

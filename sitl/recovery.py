@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 from autopilot.failsafe import FLOWN_BY_LAW, Mode
 from autopilot.link.clock import NS_PER_S
-from sitl.faults import ClockDrift, ClockStep, DiskFull, Phase, parse_fault
+from sitl.faults import ClockDrift, ClockStep, DiskFull, Fault, Phase, fault_of, format_fault
 
 __all__ = ["LASTING_NS", "Recovery", "longest_recovery_s", "recoveries"]
 
@@ -98,8 +98,8 @@ class _Flown:
 
 def recoveries(kept: Sequence[Kept]) -> list[Recovery]:
     """Return each fault that the records tell of, in the order of beginning."""
-    faults = [entry for entry in kept if entry[0] == "events" and entry[2]["kind"] == "fault"]
-    if not faults:
+    changes = [(at_ns, *change) for topic, at_ns, body in kept if topic == "events" and (change := fault_of(body))]
+    if not changes:
         return []
     flown = _Flown([], [], [])
     for topic, at_ns, body in sorted(kept, key=itemgetter(1)):
@@ -109,25 +109,25 @@ def recoveries(kept: Sequence[Kept]) -> list[Recovery]:
             flown.modes.append((at_ns, body["mode"]))
         elif topic == "events" and body["kind"] == "failsafe":
             flown.modes.append((at_ns, body["data"]["to"]))
-    periods = _periods(sorted(faults, key=itemgetter(1)))
+    periods = _periods(sorted(changes, key=itemgetter(0)))
     flown.begins_ns.extend(period.begin_ns for period in periods)
     zero_ns = next((at_ns for topic, at_ns, _ in flown.steps if topic == "plant/truth"), 0)
     return [_recovery(period, flown, zero_ns) for period in periods]
 
 
-def _periods(faults: Sequence[Kept]) -> list[_Period]:
-    """Return what the events tell, each begin with the first end of the same text that is not another's."""
+def _periods(changes: Sequence[tuple[int, Fault, Phase]]) -> list[_Period]:
+    """Return what the events tell, each begin with the first end of the same fault that is not another's."""
     periods = []
-    ends = [(body["data"]["fault"], at_ns) for _, at_ns, body in faults if body["data"]["phase"] == Phase.END]
-    for _, at_ns, body in faults:
-        if body["data"]["phase"] != Phase.BEGIN:
+    ends = [(fault, at_ns) for at_ns, fault, phase in changes if phase is Phase.END]
+    for at_ns, fault, phase in changes:
+        if phase is Phase.END:
             continue
-        text = body["data"]["fault"]
-        end = next((end for end in ends if end[0] == text and end[1] >= at_ns), None)
+        end = next((end for end in ends if end[0] == fault and end[1] >= at_ns), None)
         if end is not None:
             ends.remove(end)
-        at_once = isinstance(parse_fault(text), ClockStep | ClockDrift | DiskFull)
-        periods.append(_Period(text, at_ns, at_ns if at_once else None if end is None else end[1]))
+        at_once = isinstance(fault, ClockStep | ClockDrift | DiskFull)
+        end_ns = at_ns if at_once else None if end is None else end[1]
+        periods.append(_Period(format_fault(fault), at_ns, end_ns))
     return periods
 
 

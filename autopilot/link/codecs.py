@@ -7,7 +7,7 @@ Frames around the payloads are :mod:`autopilot.link.wire`.
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, fields
 from operator import attrgetter
 from typing import Any
@@ -27,8 +27,9 @@ from autopilot.link.messages import (
     Timesync,
     VfrHud,
 )
+from gains.table import InputError
 
-__all__ = ["CODECS", "CONTROL_MESSAGES", "GROUND_MESSAGES", "U32", "Codec", "message_id"]
+__all__ = ["CODECS", "CONTROL_MESSAGES", "GROUND_MESSAGES", "U32", "Codec", "message_id", "message_ids"]
 
 U32 = 0xFFFFFFFF
 ELEVATOR_CHANNEL = 1
@@ -276,3 +277,29 @@ GROUND_MESSAGES = frozenset(_GROUND_CODECS) | {Heartbeat, Timesync}
 def message_id(message: type) -> int:
     """Return the MAVLink id of a message type."""
     return CODECS[message].id
+
+
+_IDS = {native.msgname: number for number, native in dialect.mavlink_map.items()}
+_IDS |= {"AVAILABLE_MODES": _AVAILABLE_MODES.id, "CURRENT_MODE": _CURRENT_MODE.id}
+_MAX_ID = (1 << 24) - 1
+
+
+def message_ids(names: Iterable[str]) -> frozenset[int]:
+    """Return the MAVLink ids of messages named as in ``ATTITUDE`` or by number; a number need not be known here.
+
+    Raises
+    ------
+    InputError
+        For a name that the dialect does not have, or a number that no message can have.
+    """
+    ids = set()
+    for name in names:
+        numbered = name.isascii() and name.isdigit() and len(name) <= 8
+        number = int(name) if numbered else _IDS.get(name)
+        if number is None or number > _MAX_ID:
+            raise InputError(
+                f"message: expected a MAVLink name such as ATTITUDE or a number up to {_MAX_ID}, found "
+                f"{name or 'nothing'}"
+            )
+        ids.add(number)
+    return frozenset(ids)

@@ -16,6 +16,7 @@ from typing import Any
 __all__ = ["FRAME_SCHEMA", "SCHEMAS", "is_topic", "schema_of"]
 
 _FRAME_TOPIC = re.compile(r"mavlink/[a-z0-9_-]{1,32}")
+_LINK_TOPIC = re.compile(r"link/[a-z0-9_-]{1,32}/(up|down)")
 
 
 def _field(kind: str, description: str, *, nullable: bool = False, **more: Any) -> dict[str, Any]:
@@ -28,8 +29,13 @@ def _vector(description: str, *, nullable: bool = False) -> dict[str, Any]:
     return _field("array", description, nullable=nullable, items={"type": "number"})
 
 
-def _schema(title: str, description: str, **fields: dict[str, Any]) -> Mapping[str, Any]:
-    """Return a topic's JSON Schema; every field is required, more fields are allowed."""
+def _schema(
+    title: str,
+    description: str,
+    optional: Mapping[str, dict[str, Any]] = MappingProxyType({}),
+    **fields: dict[str, Any],
+) -> Mapping[str, Any]:
+    """Return a topic's JSON Schema; every field but the optional ones is required, more fields are allowed."""
     certain = {name: field for name, field in fields.items() if isinstance(field["type"], str)}
     nullable = {name: field for name, field in fields.items() if name not in certain}
     schema = {
@@ -37,7 +43,7 @@ def _schema(title: str, description: str, **fields: dict[str, Any]) -> Mapping[s
         "title": title,
         "description": description,
         "type": "object",
-        "properties": certain,
+        "properties": certain | dict(optional),
         "required": list(fields),
         "additionalProperties": True,
     }
@@ -57,6 +63,17 @@ def _link_schema(title: str, way: str) -> Mapping[str, Any]:
         size=_field("integer", "Payload, bytes."),
         fate=_field("string", "What the link did with it: delivered, lost, blackout, refused or gated."),
         copy=_field("integer", "0 for the packet itself, 1 and up for duplicates."),
+        requested_ns=_field(
+            "integer", "Delay that the link's model asked for, ns; null if it was dropped before.", nullable=True
+        ),
+        optional={
+            "bits": _field(
+                "array",
+                "Bits that were flipped, by number; 0 is the lowest of the first byte.",
+                items={"type": "integer"},
+            ),
+            "rule": _field("string", "Messages of the rule that applied, instead of the direction's SPEC."),
+        },
     )
 
 
@@ -137,7 +154,7 @@ SCHEMAS: Mapping[str, Mapping[str, Any]] = MappingProxyType(
         ),
     }
 )
-"""JSON Schema of each fixed topic; ``schema_of`` also knows ``mavlink/<port>``."""
+"""JSON Schema of each fixed topic; ``schema_of`` also knows ``mavlink/<port>`` and ``link/<name>/up``, ``.../down``."""
 
 FRAME_SCHEMA = _schema(
     "MAVLink datagram",
@@ -151,7 +168,7 @@ FRAME_SCHEMA = _schema(
 
 def is_topic(topic: str) -> bool:
     """Return whether a recording knows the topic."""
-    return topic in SCHEMAS or _FRAME_TOPIC.fullmatch(topic) is not None
+    return topic in SCHEMAS or _FRAME_TOPIC.fullmatch(topic) is not None or _LINK_TOPIC.fullmatch(topic) is not None
 
 
 def schema_of(topic: str) -> Mapping[str, Any]:
@@ -163,5 +180,8 @@ def schema_of(topic: str) -> Mapping[str, Any]:
         If the topic is unknown.
     """
     if not is_topic(topic):
-        raise ValueError(f"unknown topic {topic[:80]!r}; known are {', '.join(SCHEMAS)} and mavlink/<port>")
+        known = f"{', '.join(SCHEMAS)}, link/<name>/up, link/<name>/down and mavlink/<port>"
+        raise ValueError(f"unknown topic {topic[:80]!r}; known are {known}")
+    if _LINK_TOPIC.fullmatch(topic):
+        return SCHEMAS[f"link/{topic.rpartition('/')[2]}"]
     return SCHEMAS.get(topic, FRAME_SCHEMA)

@@ -9,15 +9,17 @@ One packet meets, in this order:
 1. loss: by chance, in a bad time of the radio, or by the trace: gone, with no airtime used (as netem, which drops
    before it queues);
 2. blackout: a radio that is out neither takes nor delivers, so a packet is dropped if it enters during
-   ``[start, start + duration)``, and so is a copy whose exit would fall inside;
+   ``[start, start + length)``, and so is a copy whose exit would fall inside;
 3. duplication: a second copy, which then takes its own turn through the rest;
 4. room: a copy the queue has no room for is refused, with no airtime used (``limit``: copies under way);
 5. corruption: some bits of a copy are flipped;
 6. reordering, as netem: with this probability a copy skips the rest but order, leaves at once and overtakes the
-   queue; with ``gap=N`` only a copy that comes N - 1 or more after the last one that did so;
+   queue; with ``gap=N`` only after N - 1 copies that did not;
 7. sending: a copy waits until the one before is serialised, while the link pauses (``hold``, ``handover``), and for a
-   slot, whatever ends last, then takes ``8 size / rate``; size is that of the datagram handed in, without headers;
-8. delay plus jitter plus what the trace says, never below 0 together, plus the radio's in a bad time;
+   slot, whatever ends last, then takes ``8 size / rate``; size is that of the datagram handed in, without headers.
+   What waits when a slot opens goes back to back, as many as the slot takes; who comes later, or meets a pause,
+   waits for the next slot, and one that opens while the link still sends is missed;
+8. delay plus jitter plus what the trace says plus the radio's in a bad time, never below 0 together;
 9. ``order=keep``: no copy leaves before one that left the stages above earlier. It wins over
    reordering: such a copy leaves as early as order allows.
 
@@ -26,6 +28,19 @@ first copy; the same of the second; the radio's times, its losses; handovers), o
 the packets before and whatever becomes of this one (two for loss in bursts: the move of its state and the loss). The
 n-th packet's jitter is therefore the same with loss and without, at 1 % and at 10 %: flights under different
 links compare packet by packet.
+
+Otherwise than netem, on purpose:
+
+- A lost packet is lost with its duplicate: one event in the air. netem draws both and lets one copy through if both
+  happen; the clone it enqueues then meets loss anew.
+- Jitter and loss correlate by models that keep their distribution and rate; ``get_crandom``, by which netem correlates
+  duplication, reordering and corruption too, keeps neither (:mod:`sitl.link.jitters`, ``CorrelatedLoss``).
+- The rate comes before the delay: jitter may reorder what was serialised. In netem a packet is sent after the last one
+  in the queue has left, so that a rate keeps the order whatever the jitter. With a constant delay both are the same.
+- Bits are flipped in the datagram's payload, and it arrives, as from a serial radio that checks nothing. netem flips
+  one bit anywhere in the packet, which UDP's checksum then refuses; here that is ``loss``.
+- Slots are the multiples of a period, and precede the delay. In netem they follow it, and the next one is counted from
+  when the budget of the last was used up.
 
 To add a model, write a class in :mod:`sitl.link.jitters`, :mod:`sitl.link.losses` or :mod:`sitl.link.interruptions`.
 
@@ -37,9 +52,10 @@ Linux ``net/sched/sch_netem.c``.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -84,13 +100,14 @@ class LinkSpec:
     jitter : Jitter or None
         Distribution of the time added to the delay.
     correlation : float
-        Of the jitter, from one packet to the next: rho of :mod:`sitl.link.jitters`, from 0 to below 1.
+        Of the jitter, from one packet to the next: rho of :mod:`sitl.link.jitters`, from 0 to below 1; 0 without
+        jitter.
     loss : float or Loss
         Probability that a packet is lost, from 0 to 1, or a model with memory.
     dup, reorder : float
         Probabilities per packet (reorder: per copy), from 0 to 1.
     gap : int
-        The fewest copies from one that overtakes to the next, itself included; 1 for no such limit.
+        The fewest copies from one that overtakes to the next, itself included, and to the first one; 1 for no limit.
     corruption : Corruption or None
         Flipped bits.
     keep_order : bool
@@ -132,6 +149,7 @@ class LinkSpec:
     def __post_init__(self) -> None:
         assert self.delay_ns >= 0
         assert 0.0 <= self.correlation < 1.0
+        assert self.correlation == 0.0 or self.jitter is not None
         assert isinstance(self.loss, Loss) or 0.0 <= self.loss <= 1.0
         assert all(0.0 <= probability <= 1.0 for probability in (self.dup, self.reorder))
         assert self.gap >= 1
@@ -162,40 +180,35 @@ class Copy(NamedTuple):
     flipped: tuple[int, ...] = ()
 
 
-class _Draw(NamedTuple):
-    """What chance has for one copy: whether it would overtake, its delay and jitter, and the bits that are flipped."""
+_Draw: TypeAlias = tuple[bool, int, tuple[int, ...]]
+"""What chance has for one copy: whether it would overtake, its delay and jitter (ns), and the bits that are flipped.
 
-    overtakes: bool
-    flight_ns: int
-    flipped: tuple[int, ...]
+A plain tuple, since there is one per packet.
+"""
 
 
-class _CopyStreams:
-    """The random streams of the first, or of the second, copies."""
+def _draws(
+    spec: LinkSpec, reorder: np.random.Generator, jitter: np.random.Generator, corrupt: np.random.Generator
+) -> Callable[[int], _Draw]:
+    """Return a source of draws for the first, or for the second, copies of packets of the sizes that it is told."""
+    overtaking, random = spec.reorder, reorder.random
+    delay_ns, corruption = spec.delay_ns, spec.corruption
+    further_ns = None if spec.jitter is None else spec.jitter.sampler(jitter, spec.correlation)
 
-    def __init__(
-        self, spec: LinkSpec, reorder: np.random.Generator, jitter: np.random.Generator, corrupt: np.random.Generator
-    ) -> None:
-        self._spec = spec
-        self._reorder = reorder.random
-        self._jitter = None if spec.jitter is None else spec.jitter.sampler(jitter, spec.correlation)
-        self._corrupt = corrupt
+    def draw(size_bytes: int) -> _Draw:
+        overtakes = overtaking > 0.0 and random() < overtaking
+        flight_ns = delay_ns if further_ns is None else delay_ns + round(further_ns())
+        return overtakes, flight_ns, () if corruption is None else _flips(corruption, corrupt, size_bytes)
 
-    def draw(self, size_bytes: int) -> _Draw:
-        """Draw for one copy."""
-        spec = self._spec
-        overtakes = spec.reorder > 0.0 and self._reorder() < spec.reorder
-        flight_ns = spec.delay_ns
-        if self._jitter is not None:
-            flight_ns = max(0, flight_ns + round(self._jitter()))
-        flipped = () if spec.corruption is None else self._flips(spec.corruption, size_bytes)
-        return _Draw(overtakes, flight_ns, flipped)
+    return draw
 
-    def _flips(self, corruption: Corruption, size_bytes: int) -> tuple[int, ...]:
-        hit, *places = self._corrupt.random(1 + corruption.bits).tolist()
-        if hit >= corruption.probability or not size_bytes:
-            return ()
-        return tuple(int(place * 8 * size_bytes) for place in places)
+
+def _flips(corruption: Corruption, rng: np.random.Generator, size_bytes: int) -> tuple[int, ...]:
+    """Return which bits of one copy are flipped."""
+    hit, *places = rng.random(1 + corruption.bits).tolist()
+    if hit >= corruption.probability or not size_bytes:
+        return ()
+    return tuple(int(place * 8 * size_bytes) for place in places)
 
 
 class Impairment:
@@ -208,7 +221,8 @@ class Impairment:
     rng : numpy.random.Generator
         Where its streams are spawned from; none of its own values is drawn.
     before : Impairment, optional
-        What the direction did until now: its last packets still occupy the serialiser and keep their order.
+        What the direction did until now: its last packets still occupy the serialiser, if there still is one, and the
+        slot, and with ``order=keep`` none leaves before them.
     """
 
     def __init__(self, spec: LinkSpec, rng: np.random.Generator, before: Impairment | None = None) -> None:
@@ -216,24 +230,31 @@ class Impairment:
         loss, dup, *rest = rng.spawn(6)
         *corrupt, fading, fading_loss, handover = rng.spawn(5)
         self._lost = spec.loss.sampler(loss) if isinstance(spec.loss, Loss) else memoryless(spec.loss, loss)
-        self._dup = dup.random
-        self._copies = tuple(_CopyStreams(spec, rest[n], rest[2 + n], corrupt[n]) for n in range(2))
+        self._dup = dup.random if spec.dup > 0.0 else None
+        self._first, self._second = (_draws(spec, rest[n], rest[2 + n], corrupt[n]) for n in range(2))
         self._bad_at = None if spec.fading is None else spec.fading.process(fading)
         self._fading_lost = None if spec.fading is None else memoryless(spec.fading.loss, fading_loss)
         self._resume_ns = None if spec.handover is None else spec.handover.process(handover)
+        self._adds = spec.trace is not None or spec.fading is not None
         self._pauses = bool(spec.holds or spec.handover or spec.slots)
+        self._queues = self._pauses or spec.rate_bps is not None
+        self._blackouts, self._limit, self._keep_order = spec.blackouts, spec.limit, spec.keep_order
+        self._apart = spec.gap - 1
         self._number = 0
         """Of the packet, for a trace without times."""
         self._since_overtaking = 0
-        """Copies since one overtook, at most gap - 1."""
+        """Copies since one overtook, at most ``_apart``."""
         self._busy = 0
         """When the serialiser is free, in 1/rate ns of link time: integers, so that no error adds up."""
         self._slot, self._in_slot = -1, 0
         """The latest slot in use, and how many packets have begun in it."""
         self._last_exit_ns = 0
+        """The latest instant at which a copy leaves."""
         if before is not None:
             self._busy = before.free_ns * (spec.rate_bps or 1)
             self._last_exit_ns = before._last_exit_ns
+            if before.spec.slots == spec.slots:
+                self._slot, self._in_slot = before._slot, before._in_slot
 
     @property
     def free_ns(self) -> int:
@@ -263,24 +284,22 @@ class Impairment:
             One, or two if it was duplicated. A copy in flight that meets a blackout has the instant at
             which it would have left: until then it is in the queue.
         """
-        spec = self.spec
-        lost = self._lost()
-        extra_ns = self._extra_ns(now_ns)
-        draws = [self._copies[0].draw(size_bytes)]
-        if spec.dup > 0.0:
-            twice, further = self._dup() < spec.dup, self._copies[1].draw(size_bytes)
-            if twice:
-                draws.append(further)
+        lost, draw = self._lost(), self._first(size_bytes)
+        further: _Draw | None = None
+        if self._dup is not None:
+            twice, second = self._dup() < self.spec.dup, self._second(size_bytes)
+            further = second if twice else None
+        extra_ns = self._extra_ns(now_ns) if self._adds else 0
         if lost or extra_ns is None:
             return (Copy(Fate.LOST, now_ns),)
-        if spec.blackouts and spec.is_out(now_ns):
+        if self._blackouts and self.spec.is_out(now_ns):
             return (Copy(Fate.BLACKOUT, now_ns),)
-        room = spec.limit - queued
-        if room > 0 and len(draws) == 1:  # as nearly always
-            return (self._launch(size_bytes, now_ns, draws[0], extra_ns),)
+        room = self._limit - queued
+        if room > 0 and further is None:  # as nearly always
+            return (self._launch(size_bytes, now_ns, draw, extra_ns),)
         return tuple(
-            self._launch(size_bytes, now_ns, draw, extra_ns) if n < room else Copy(Fate.REFUSED, now_ns)
-            for n, draw in enumerate(draws)
+            self._launch(size_bytes, now_ns, each, extra_ns) if n < room else Copy(Fate.REFUSED, now_ns)
+            for n, each in enumerate((draw,) if further is None else (draw, further))
         )
 
     def _extra_ns(self, now_ns: int) -> int | None:
@@ -297,22 +316,27 @@ class Impairment:
 
     def _launch(self, size_bytes: int, now_ns: int, draw: _Draw, extra_ns: int) -> Copy:
         """Return the exit of a copy that is neither lost nor refused; occupy the serialiser."""
-        spec = self.spec
+        overtakes, flight_ns, flipped = draw
         exit_ns = now_ns
-        if draw.overtakes and self._since_overtaking >= spec.gap - 1:
+        if overtakes and self._since_overtaking >= self._apart:
             self._since_overtaking = 0
         else:
-            self._since_overtaking = min(self._since_overtaking + 1, spec.gap - 1)
-            if spec.rate_bps is not None or self._pauses:
+            if self._since_overtaking < self._apart:
+                self._since_overtaking += 1
+            if self._queues:
                 sent_ns = self._serialise(size_bytes, now_ns)
                 if sent_ns is None:
                     return Copy(Fate.REFUSED, now_ns)
                 exit_ns = sent_ns
-            exit_ns += draw.flight_ns + extra_ns
-        if spec.keep_order:
-            exit_ns = self._last_exit_ns = max(exit_ns, self._last_exit_ns)
-        out = bool(spec.blackouts) and spec.is_out(exit_ns)
-        return Copy(Fate.BLACKOUT if out else Fate.DELIVERED, exit_ns, draw.flipped)
+            flight_ns += extra_ns
+            if flight_ns > 0:
+                exit_ns += flight_ns
+        if exit_ns >= self._last_exit_ns:
+            self._last_exit_ns = exit_ns
+        elif self._keep_order:
+            exit_ns = self._last_exit_ns
+        out = self._blackouts and self.spec.is_out(exit_ns)
+        return Copy(Fate.BLACKOUT if out else Fate.DELIVERED, exit_ns, flipped)
 
     def _serialise(self, size_bytes: int, now_ns: int) -> int | None:
         """Return when a copy that may be sent from now on has been sent; None when no time ever is free."""
@@ -320,7 +344,7 @@ class Impairment:
         begin = max(self._busy, now_ns * rate)
         if self._pauses:
             ready_ns = -(-begin // rate)
-            begin_ns = self._begin_ns(ready_ns)
+            begin_ns = self._begin_ns(now_ns, ready_ns)
             if begin_ns is None:
                 return None
             if begin_ns > ready_ns:
@@ -328,31 +352,40 @@ class Impairment:
         self._busy = begin + (0 if self.spec.rate_bps is None else 8 * size_bytes * NS_PER_S)
         return self.free_ns
 
-    def _begin_ns(self, ready_ns: int) -> int | None:
-        """Return when the link next lets a packet begin: outside every pause, and in a slot with room."""
-        spec, begin_ns = self.spec, ready_ns
+    def _begin_ns(self, now_ns: int, ready_ns: int) -> int | None:
+        """Return when the link next lets a packet begin: outside every pause, and in a slot with room.
+
+        ``now_ns`` is when it entered, ``ready_ns`` when the packet before is through.
+        """
+        spec, slots, begin_ns = self.spec, self.spec.slots, ready_ns
+        follows = slots is not None and now_ns <= self._slot * slots.period_ns and self._has_room(slots)
         for _ in range(MAX_PAUSES):
             waited_ns = begin_ns
             for window in spec.holds:
                 waited_ns = window.end_ns(waited_ns) or waited_ns
             if self._resume_ns is not None:
                 waited_ns = self._resume_ns(waited_ns)
-            if spec.slots is not None:
-                waited_ns = self._slot_ns(spec.slots, waited_ns)
+            if slots is not None and not (follows and waited_ns == ready_ns):
+                waited_ns = self._slot_ns(slots, waited_ns)
             if waited_ns == begin_ns:
                 break
             begin_ns = waited_ns
         else:
             return None
-        if spec.slots is not None:
-            slot = begin_ns // spec.slots.period_ns
-            self._in_slot = self._in_slot + 1 if slot == self._slot else 1
-            self._slot = slot
+        if slots is not None:
+            if follows and begin_ns == ready_ns:
+                self._in_slot += 1
+            else:
+                self._slot, self._in_slot = begin_ns // slots.period_ns, 1
         return begin_ns
 
+    def _has_room(self, slots: Slots) -> bool:
+        """Return whether one more packet may begin in the latest slot in use."""
+        return not slots.packets or self._in_slot < slots.packets
+
     def _slot_ns(self, slots: Slots, ready_ns: int) -> int:
-        """Return the first slot from then on that has room."""
+        """Return when the first slot from then on opens that has room."""
         slot = -(-ready_ns // slots.period_ns)
-        if slots.packets and slot <= self._slot:
-            slot = self._slot + (self._in_slot >= slots.packets)
+        if slot == self._slot and not self._has_room(slots):
+            slot += 1
         return slot * slots.period_ns

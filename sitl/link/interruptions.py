@@ -12,7 +12,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-__all__ = ["Fading", "Handover", "Slots", "Window"]
+__all__ = ["MIN_MEAN_NS", "Fading", "Handover", "Slots", "Window"]
+
+MIN_MEAN_NS = 1_000_000
+"""The least mean time from one random interruption to the next: each is drawn, also those that no packet meets."""
 
 
 class Window(NamedTuple):
@@ -49,13 +52,17 @@ class Handover:
     Attributes
     ----------
     every_ns : int
-        Mean time from the end of one to the beginning of the next, above 0.
+        Mean time from the end of one to the beginning of the next, ``MIN_MEAN_NS`` or more.
     length_ns : int
         How long each takes.
     """
 
     every_ns: int
     length_ns: int
+
+    def __post_init__(self) -> None:
+        assert self.every_ns >= MIN_MEAN_NS
+        assert self.length_ns >= 0
 
     def process(self, rng: np.random.Generator) -> Callable[[int], int]:
         """Return a function from an instant to when the link sends next; instants must not fall. It owns ``rng``."""
@@ -80,7 +87,7 @@ class Fading:
     Attributes
     ----------
     good_ns, bad_ns : int
-        Mean length of a good and of a bad time, G and B, above 0.
+        Mean length of a good and of a bad time, G and B, ``MIN_MEAN_NS`` or more.
     extra_ns : int
         Delay added to a packet that enters while the radio is bad.
     loss : float
@@ -92,6 +99,11 @@ class Fading:
     extra_ns: int
     loss: float = 0.0
 
+    def __post_init__(self) -> None:
+        assert min(self.good_ns, self.bad_ns) >= MIN_MEAN_NS
+        assert self.extra_ns >= 0
+        assert 0.0 <= self.loss <= 1.0
+
     def process(self, rng: np.random.Generator) -> Callable[[int], bool]:
         """Return a function from an instant to whether it is bad; instants must not fall. It owns ``rng``."""
         is_bad = False
@@ -101,7 +113,7 @@ class Fading:
             nonlocal is_bad, end_ns
             while link_ns >= end_ns:
                 is_bad = not is_bad
-                end_ns += max(1, round(rng.exponential(self.bad_ns if is_bad else self.good_ns)))
+                end_ns += round(rng.exponential(self.bad_ns if is_bad else self.good_ns))
             return is_bad
 
         return bad_at
@@ -109,7 +121,9 @@ class Fading:
 
 @dataclass(frozen=True, slots=True)
 class Slots:
-    """A shared channel that may be used at the multiples of a period only: TDMA radios, satellites' frames.
+    """A shared channel that opens at the multiples of a period only: TDMA radios, satellites' frames.
+
+    Who waits when it opens is sent then, one behind the other.
 
     Attributes
     ----------

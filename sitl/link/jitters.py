@@ -3,14 +3,20 @@
 A correlated jitter follows exactly the distribution that was asked for. It is a Gaussian copula:
 z(n) = rho z(n-1) + sqrt(1 - rho²) e(n) with e(n) standard normal, and the jitter is F⁻¹(Φ(z(n))). The
 autocorrelation of normal jitter is rho^lag then, and the rank correlation of any jitter 6/π asin(rho^lag / 2).
-(netem blends two uniform numbers instead, which narrows the distribution as the correlation grows.)
+
+Otherwise than netem, on purpose: ``get_crandom`` blends two uniform numbers, and ``tabledist`` takes the remainder of
+the blend, by the width of the jitter or by the length of a table. Computed so, jitters of some ms come out
+uncorrelated whatever the correlation asked for, and jitters of seconds correlated but no longer uniform. netem's
+distributions are centred on the delay and its tables end at 4 standard deviations; here ``uniform``, ``gamma`` and
+``pareto`` begin at the delay, as the queues that they stand for do, and nothing is cut off.
 
 To add a model: a class here, registered with ``@_named(...)``.
 
 References
 ----------
 R. B. Nelsen, "An Introduction to Copulas", 2nd ed., 2006; W. H. Kruskal, "Ordinal measures of association",
-J. Am. Stat. Assoc. 53, 1958; tc-netem(8); ``get_crandom`` in Linux ``net/sched/sch_netem.c``.
+J. Am. Stat. Assoc. 53, 1958; tc-netem(8); ``get_crandom`` and ``tabledist`` in Linux
+``net/sched/sch_netem.c``; ``netem/paretonormal.c`` of iproute2.
 """
 
 from __future__ import annotations
@@ -23,7 +29,7 @@ from types import MappingProxyType
 from typing import TypeVar
 
 import numpy as np
-from scipy.special import gammaincinv, ndtr
+from scipy.special import gammainccinv, gammaincinv, ndtr
 
 __all__ = [
     "JITTERS",
@@ -174,9 +180,15 @@ class GammaJitter(Jitter):
         return lambda: theta_ns * gamma(shape)
 
     def correlated(self, normals: Callable[[], Source]) -> Source:
-        """Return the quantile of Φ(z)."""
+        """Return the quantile of Φ(z), or from P(J > t) = Φ(-z), so that neither tail loses digits."""
         z, shape, theta_ns = normals(), self.shape, self.scale_ns / self.shape
-        return lambda: theta_ns * float(gammaincinv(shape, float(ndtr(z()))))
+
+        def jitter_ns() -> float:
+            value = z()
+            share = float(ndtr(-abs(value)))
+            return theta_ns * float(gammaincinv(shape, share) if value < 0.0 else gammainccinv(shape, share))
+
+        return jitter_ns
 
 
 @_named("pareto")
@@ -209,37 +221,34 @@ class ParetoJitter(Jitter):
 @_named("paretonormal")
 @dataclass(frozen=True, slots=True)
 class ParetoNormalJitter(Jitter):
-    """Jitter S (N / 4 + 3 P / 4): a normal and a heavy-tailed part, the mixture that netem calls by this name.
+    """Jitter S Q(u) with u from U[0, 1]: as netem's table of this name, a quarter normal and three quarters Pareto.
 
-    N is standard normal, P a Lomax of exponent 3 brought to mean 0 and variance 1. A sum of delay and jitter
+    The parts are added quantile by quantile, Q(u) = Φ⁻¹(u) / 4 + (1 - u)^(-1/3) - 3/2: one packet is late in both.
+    The Pareto part, of exponent 3 and mean 0, is netem's too: (4/3) ((1 - u)^(-1/3) - 3/2). A sum of delay and jitter
     below 0 becomes 0.
 
     Attributes
     ----------
     scale_ns : int
-        The scale S; the standard deviation is S sqrt(10) / 4.
+        The scale S. The mean is 0, the standard deviation 1.05 S.
     """
 
     scale_ns: int
 
     def independent(self, rng: np.random.Generator) -> Source:
-        """Return a source of the mixture."""
-        normal, pareto, quarter_ns = rng.standard_normal, rng.pareto, self.scale_ns / 4.0
-        return lambda: quarter_ns * (normal() + 3.0 * _standard_lomax(pareto(_LOMAX_SHAPE)))
+        """Return the quantile of Φ(z) with z independent."""
+        return self.correlated(lambda: rng.standard_normal)
 
     def correlated(self, normals: Callable[[], Source]) -> Source:
-        """Return the mixture of two sequences, each correlated alike."""
-        z, y, quarter_ns = normals(), normals(), self.scale_ns / 4.0
-        return lambda: quarter_ns * (z() + 3.0 * _standard_lomax(float(ndtr(-y())) ** (-1.0 / _LOMAX_SHAPE) - 1.0))
+        """Return S Q(Φ(z)) = S (z / 4 + Φ(-z)^(-1/3) - 3/2), which loses no digits in the tail."""
+        z, scale_ns = normals(), float(self.scale_ns)
 
+        def jitter_ns() -> float:
+            value = z()
+            late = math.pow(ndtr(-value), -1.0 / 3.0)
+            return scale_ns * (value / 4.0 + late - 1.5)
 
-_LOMAX_SHAPE = 3.0
-_LOMAX_MEAN, _LOMAX_SIGMA = 0.5, math.sqrt(0.75)
-"""Of a Lomax of exponent 3 and scale 1: 1 / (a - 1), and sqrt(a / (a - 2)) / (a - 1)."""
-
-
-def _standard_lomax(value: float) -> float:
-    return (value - _LOMAX_MEAN) / _LOMAX_SIGMA
+        return jitter_ns
 
 
 @_named("table")

@@ -15,7 +15,7 @@ from typing import Any
 from autopilot.link.clock import NS_PER_MS, NS_PER_S, NS_PER_US
 from gains.table import InputError
 from sitl.link.impairment import MAX_QUEUED, Corruption, LinkSpec
-from sitl.link.interruptions import Fading, Handover, Slots, Window
+from sitl.link.interruptions import MIN_MEAN_NS, Fading, Handover, Slots, Window
 from sitl.link.jitters import (
     JITTERS,
     GammaJitter,
@@ -160,15 +160,16 @@ def _format_window(window: Window) -> str:
 
 
 def _parse_handover(text: str) -> Handover:
-    expected = "EVERY:LENGTH with EVERY above 0, as in 20s:80ms"
-    handover = Handover(*_parse_times(text, expected, 2, 2))
-    if handover.every_ns == 0:
+    expected = f"EVERY:LENGTH with EVERY at least {_format_time(MIN_MEAN_NS)}, as in 20s:80ms"
+    every_ns, length_ns = _parse_times(text, expected, 2, 2)
+    if every_ns < MIN_MEAN_NS:
         raise _Expected(expected)
-    return handover
+    return Handover(every_ns, length_ns)
 
 
 def _parse_fading(text: str) -> Fading:
-    expected = "GOOD:BAD:EXTRA[:LOSS], three times of which the first two are above 0, as in 5s:500ms:80ms:0.05"
+    least = _format_time(MIN_MEAN_NS)
+    expected = f"GOOD:BAD:EXTRA[:LOSS], three times, the first two at least {least}, as in 5s:500ms:80ms:0.05"
     *times, last = text.split(":")
     try:
         if len(times) == 3:
@@ -178,7 +179,7 @@ def _parse_fading(text: str) -> Fading:
             (good_ns, bad_ns, extra_ns), loss = _parse_times(text, expected, 3, 3), 0.0
     except _Expected:
         raise _Expected(expected) from None
-    if not (good_ns and bad_ns):
+    if min(good_ns, bad_ns) < MIN_MEAN_NS:
         raise _Expected(expected)
     return Fading(good_ns, bad_ns, extra_ns, loss)
 
@@ -314,6 +315,9 @@ _KEYWORDS: Mapping[str, _Keyword] = {
 }
 _PERFECT = LinkSpec()
 
+_NEEDED = {"corr": "jitter", "gap": "reorder"}
+"""Keywords that say nothing without another one."""
+
 
 def parse_spec(text: str) -> LinkSpec:
     """Return the direction described by a SPEC such as ``delay=25ms,jitter=uniform:28ms,loss=0.1``.
@@ -339,18 +343,22 @@ def parse_spec(text: str) -> LinkSpec:
         except _Expected as error:
             raise InputError(f"{where}: {name}: expected {error}, found {value or 'nothing'}") from None
         fields[keyword.field] = (*fields.get(keyword.field, ()), parsed) if keyword.repeats else parsed
-    for name, needed in (("correlation", "jitter"), ("gap", "reorder")):
-        if name in fields and needed not in fields:
-            raise InputError(f"{where}: expected {needed}=… beside {'corr' if name == 'correlation' else name}")
+    for name, needed in _NEEDED.items():
+        if _KEYWORDS[name].field in fields and _KEYWORDS[needed].field not in fields:
+            raise InputError(f"{where}: {name}: expected {needed}=… beside it, found none")
     return LinkSpec(**fields)
 
 
 def format_spec(spec: LinkSpec) -> str:
     """Return the SPEC of a direction; the inverse of :func:`parse_spec`."""
     items: list[str] = []
+    said = {
+        name for name, keyword in _KEYWORDS.items() if getattr(spec, keyword.field) != getattr(_PERFECT, keyword.field)
+    }
+    said |= {needed for name, needed in _NEEDED.items() if name in said}
     for name, keyword in _KEYWORDS.items():
-        value = getattr(spec, keyword.field)
-        if value != getattr(_PERFECT, keyword.field):
+        if name in said:
+            value = getattr(spec, keyword.field)
             values = value if keyword.repeats else (value,)
             items.extend(f"{name}={keyword.format(each)}" for each in values)
     return ",".join(items) or "delay=0ns"

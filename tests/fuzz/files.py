@@ -32,7 +32,7 @@ from gains.table import InputError, Table
 from gains.verify import verified
 from gains.witnessfile import read_witness, write_witness
 from sitl.link.tracefiles import MAX_DELAY_NS, load_table, load_trace
-from sitl.recover import recover
+from sitl.rescue import recover
 from sitl.scenario import autopilot_arguments, load_scenario, plant_arguments, relay_arguments
 from tests.fuzz.refusing import refusing
 from tests.fuzz.texts import TS, check_source

@@ -54,7 +54,7 @@ def test_equal_seeds_make_equal_bytes_and_other_seeds_others(
 
 
 @pytest.mark.parametrize("seed", [1, 2])
-@pytest.mark.parametrize("name", stored_scenarios())
+@pytest.mark.parametrize("name", [name for name in stored_scenarios() if not name.startswith("fault-")])
 def test_every_stored_scenario_passes_its_checks_in_virtual_time(name: str, seed: int) -> None:
     scenario = load_scenario(name)
     variants = {variant: replace(changed, seed=seed) for variant, changed in scenario.variants.items()}

@@ -10,24 +10,25 @@ from __future__ import annotations
 
 import io
 import json
-import os
-import random
 import re
 import signal
 import statistics
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from mcap.reader import make_reader
 from rich.console import Console
 
 from sitl.faults import PROGRAMS, parse_fault
+from sitl.flightdata import FlightData
 from sitl.fly import FlightOptions, fly
+from sitl.plot import flight_figure
 from sitl.scenario import load_scenario
 from tests.integration.programs import alive, children_of, eventually, program
 
@@ -102,7 +103,7 @@ KILL_ORDER = ("relay", "autopilot", "plant")
 
 @pytest.fixture(scope="module")
 def kills(tmp_path_factory: pytest.TempPathFactory) -> Flight:
-    rng = random.Random(53)
+    rng = np.random.default_rng(53)
     instants = zip(KILL_ORDER, (1.0, 6.0, 11.0), strict=True)
     faults = [f"kill:{name}@{start_s + rng.uniform(0.0, 0.5):.3f}s+0.3s" for name, start_s in instants]
     return flown(tmp_path_factory.mktemp("kills"), 16.0, *faults)
@@ -123,7 +124,6 @@ def test_a_kill_loses_at_most_the_last_second_of_the_killed_programs_records(kil
     kill = kills.recovery(f"kill:{name}")
     before = kills.times(TOPICS[name], end_s=kill["begin_s"])
     assert kill["begin_s"] - max(before) <= LOST_S
-    assert gaps([0.0, *(at_s for at_s in before if at_s > kill["begin_s"] - 1.0)]) == []
     assert kills.times(TOPICS[name], kill["begin_s"] + 0.1, kill["end_s"]) == []
     after = kills.times(TOPICS[name], kill["recovered_s"], kill["recovered_s"] + LOST_S)
     assert after, "its records do not go on"
@@ -143,9 +143,20 @@ def test_a_flight_with_kills_ends_in_time_complete_and_without_complaint(kills: 
     assert kills.summary["duration_s"] == pytest.approx(16.0, abs=0.051)
     assert kills.summary["problems"] == []
     assert kills.complaints() == []
-    assert (kills.folder / "flight.png").stat().st_size > 10_000
     assert {body["text"].partition(",")[0] for _, body in kills.events("start")} == {"listens again"}
     assert [body["node"] for _, body in kills.events("start")] == list(KILL_ORDER)
+
+
+def test_the_plot_draws_no_line_over_the_time_without_a_plant(kills: Flight) -> None:
+    records = [(topic, round((at_s + 1.0) * 1e9), body) for topic, at_s, body in kills.records]
+    flight = FlightData.from_records(records, load_scenario("nominal").plant)
+    kill = kills.recovery("kill:plant")
+    [theta] = [line for line in flight_figure(flight).axes[0].lines if line.get_label() == "θ"]
+    time_s, values = np.asarray(theta.get_xdata()), np.asarray(theta.get_ydata())
+    [gap] = np.flatnonzero(np.isnan(values))
+    assert kill["begin_s"] - 0.1 < time_s[gap] < kill["end_s"]
+    assert kill["end_s"] < time_s[gap + 1] < kill["recovered_s"]
+    assert (kills.folder / "flight.png").stat().st_size > 10_000
 
 
 # Everything else
@@ -198,7 +209,7 @@ def test_the_plant_flies_every_sample_though_it_stood_still(troubles: Flight) ->
 
 def test_nothing_that_a_mute_autopilot_sends_arrives(troubles: Flight) -> None:
     mute = troubles.recovery("mute:autopilot")
-    assert troubles.times("link/down", mute["begin_s"] + 0.15, mute["end_s"]) == []
+    assert troubles.times("link/down", mute["begin_s"] + 0.25, mute["end_s"]) == []
     assert troubles.times("plant/truth", mute["begin_s"], mute["end_s"])
     assert troubles.times("link/down", mute["end_s"], mute["end_s"] + LOST_S)
 
@@ -227,6 +238,7 @@ def test_an_autopilot_refuses_a_damaged_gain_file_in_one_line_and_flies_when_it_
 # Ends
 
 
+@pytest.mark.long  # the supervisor's own test does the same to one program
 @needs_proc
 @needs_sigstop
 def test_ctrl_c_while_a_program_is_frozen_ends_all_of_them_in_order(tmp_path: Path) -> None:
@@ -254,10 +266,10 @@ SLOT_S = 4.5
 
 
 @pytest.fixture(scope="module", params=PROGRAMS)
-def many_kills(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Flight]:
-    rng = random.Random(f"17 of {request.param}")
+def many_kills(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Flight:
+    rng = np.random.default_rng(PROGRAMS.index(request.param))
     faults = [f"kill:{request.param}@{1.0 + SLOT_S * n + rng.uniform(0.0, 1.0):.3f}s+0.3s" for n in range(17)]
-    yield flown(tmp_path_factory.mktemp("many"), 1.0 + SLOT_S * 17, *faults)
+    return flown(tmp_path_factory.mktemp("many"), 1.0 + SLOT_S * 17, *faults)
 
 
 @pytest.mark.long

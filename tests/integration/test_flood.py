@@ -29,6 +29,8 @@ from tests.bench.flood import HOME, NS_PER_S, STATION_HZ, STRANGER_HZ, free_port
 from tests.bench.turnaround import FakePlant
 from tests.integration.programs import TIMEOUT_S, eventually, program
 
+pytestmark = pytest.mark.realtime
+
 LOAD_NS = 2 * NS_PER_S
 """What the programs that flood are given to load."""
 FLOOD_NS = 2 * NS_PER_S

@@ -47,6 +47,8 @@ from gains.store import resolve
 from tests.helpers import HEARTBEAT, broken
 from tests.integration.programs import a_socket, eventually, free_port, listens, program, topics_in
 
+pytestmark = pytest.mark.realtime
+
 DATAGRAMS = 100_000
 BURST = 200
 KINDS = 10_000

@@ -23,10 +23,13 @@ from mcap.reader import make_reader
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from autopilot.link.record import read_mcap
-from sitl.recover import recover
+from sitl.rescue import recover
 from tests.integration.programs import ENVIRONMENT, Program, a_socket, alive, children_of, eventually, program
 
-pytestmark = pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="finds the programs in /proc")
+pytestmark = [
+    pytest.mark.realtime,
+    pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="finds the programs in /proc"),
+]
 
 LOSS_S = 1.0
 """What a kill may cost."""

@@ -11,6 +11,8 @@ from autopilot.ground.parameters import PARAMETERS
 from tests.integration.groundtools import PREARM_CHECK, STEP_RAD, MavProxy, mavproxy, near, vehicle
 from tests.integration.programs import eventually, free_port
 
+pytestmark = pytest.mark.realtime
+
 PARAMETER, VALUE, OUT_OF_RANGE = "STICK_DEG", 7.5, -1.0
 PASSPHRASE = "a good passphrase"
 """Both links of the vehicle are signed; the other tools' are not."""

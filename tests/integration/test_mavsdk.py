@@ -26,6 +26,8 @@ from autopilot.ground.parameters import PARAMETERS
 from tests.integration.groundtools import near, vehicle
 from tests.integration.programs import free_port
 
+pytestmark = pytest.mark.realtime
+
 PATIENCE_S = 20.0
 """Only a test that is about to fail waits so long."""
 PARAMETER, VALUE, OUT_OF_RANGE = "STICK_DEG", 7.5, -1.0

@@ -41,6 +41,8 @@ from tests.integration.programs import (
 )
 from tests.integration.recursion import tables
 
+pytestmark = pytest.mark.realtime
+
 needs_proc = pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="finds the programs in /proc")
 
 PROGRAMS = ("plant", "relay", "autopilot")

@@ -11,6 +11,8 @@ import pytest
 
 from tests.integration.programs import eventually
 
+pytestmark = pytest.mark.realtime
+
 pytest_plugins = ("pytester",)
 
 ROOT = Path(__file__).parents[2]

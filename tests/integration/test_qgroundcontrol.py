@@ -24,6 +24,8 @@ from tests.helpers import HIRM, MS, S
 from tests.integration.groundtools import vehicle
 from tests.integration.programs import a_socket
 
+pytestmark = pytest.mark.realtime
+
 QGC = (255, 190)
 WITHIN_S = 1.0
 ACCEPTED = dialect.MAV_RESULT_ACCEPTED

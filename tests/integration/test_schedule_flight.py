@@ -23,6 +23,8 @@ from sitl.recorder import FlightRecorder
 from sitl.scenario import Scenario, load_scenario
 from tests.integration.programs import program
 
+pytestmark = pytest.mark.realtime
+
 HIRM = load_gains("hirm-paper")
 assert HIRM.K2 is not None
 SETS = (

@@ -30,6 +30,8 @@ from tests.integration.groundtools import BIN, MavProxy, mavproxy
 from tests.integration.programs import Program, eventually, free_port, program
 from tests.integration.recursion import deviation, tables
 
+pytestmark = pytest.mark.realtime
+
 MAVLOGDUMP = BIN / "mavlogdump.py"
 
 SHORT = """

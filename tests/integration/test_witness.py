@@ -30,6 +30,8 @@ from sitl.fly import FlightOptions, fly
 from sitl.scenario import Scenario, load_scenario, stored_scenarios
 from tests.integration.programs import program
 
+pytestmark = pytest.mark.realtime
+
 NAMES = ("witness", "witness-pendulum")
 
 SLOW_MODEL = """

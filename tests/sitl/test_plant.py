@@ -593,7 +593,7 @@ def test_a_bias_adds_in_the_unit_of_the_state_and_noise_is_gaussian_and_of_the_s
     assert pitches(one) == pitches(same)
     assert pitches(one) != pitches(other)
     assert abs(noise.mean()) < 4 * 0.1 / math.sqrt(400)
-    assert 0.4 * 0.8 < np.mean(np.abs(noise) > 0.067) < 0.6 * 1.1  # half of N(0, s²) lies within 0.674 s
+    assert abs(np.mean(np.abs(noise) > 0.0674) - 0.5) < 4 * 0.5 / math.sqrt(400)  # half of N(0, s²) is within 0.674 s
 
 
 def test_one_more_fault_does_not_change_the_noise_of_another():

@@ -25,7 +25,7 @@ from gains.table import InputError
 from sitl.flight import fly_virtual
 from sitl.fly import FlightOptions, fly
 from sitl.recorder import FlightRecorder
-from sitl.recover import recover
+from sitl.rescue import recover
 from sitl.scenario import load_scenario
 
 SHORT = replace(load_scenario("nominal"), duration_s=3.0, variants={})

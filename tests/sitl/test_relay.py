@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict, replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -22,7 +23,8 @@ from autopilot.link.wire import (
 )
 from gains.witnessfile import Witness
 from sitl.link.gate import Gate
-from sitl.link.impairment import MAX_QUEUED, LinkSpec
+from sitl.link.impairment import MAX_QUEUED, Corruption, LinkSpec
+from sitl.link.interruptions import Fading, Handover, Slots, Window
 from sitl.link.relay import Counters, RelayNode
 from sitl.link.spec import parse_spec
 from tests.helpers import HEARTBEAT
@@ -38,9 +40,11 @@ EXIT = {"up": "autopilot", "down": "plant"}
 class Flight:
     """A relay driven as the virtual driver does: jump to each deadline, deliveries before ticks."""
 
-    def __init__(self, up: str | LinkSpec, down: str | LinkSpec, seed: int = 1, gate: Gate | None = None) -> None:
+    def __init__(
+        self, up: str | LinkSpec, down: str | LinkSpec, seed: int = 1, gate: Gate | None = None, **more: Any
+    ) -> None:
         up, down = (parse_spec(spec) if isinstance(spec, str) else spec for spec in (up, down))
-        self.relay = RelayNode(up, down, seed, gate)
+        self.relay = RelayNode(up, down, seed, gate, **more)
         self.left: list[tuple[int, str, bytes]] = []
         self.records = []
 
@@ -77,6 +81,9 @@ def both_ways(count: int, gap_ns: int = 25 * MS) -> list[tuple[int, str]]:
 
 probabilities = st.sampled_from([0.0, 0.1, 0.5, 1.0])
 short_times = st.integers(0, 60).map(lambda ms: ms * MS)
+windows = st.lists(
+    st.builds(lambda start_ns, length_ns: Window(start_ns, length_ns, 0), short_times, short_times), max_size=2
+).map(tuple)
 link_specs = st.builds(
     lambda spec, jitter: replace(spec, jitter=parse_spec(jitter).jitter),
     st.builds(
@@ -87,7 +94,13 @@ link_specs = st.builds(
         reorder=probabilities,
         keep_order=st.booleans(),
         rate_bps=st.none() | st.sampled_from([9600, 57_600]),
-        blackouts=st.lists(st.tuples(short_times, short_times), max_size=2).map(tuple),
+        limit=st.sampled_from([1, 3, 10_000]),
+        corruption=st.none() | st.builds(Corruption, probabilities, st.integers(1, 9)),
+        slots=st.none() | st.builds(Slots, st.just(20 * MS), st.integers(0, 2)),
+        blackouts=windows,
+        holds=windows,
+        handover=st.none() | st.just(Handover(50 * MS, 30 * MS)),
+        fading=st.none() | st.just(Fading(40 * MS, 20 * MS, 30 * MS, 0.5)),
     ),
     st.sampled_from(["delay=0s", "jitter=uniform:28ms", "jitter=normal:9ms", "jitter=gamma:20ms"]),
 )
@@ -123,6 +136,7 @@ def test_every_copy_is_delivered_lost_refused_or_queued_at_every_instant(up, dow
 
 @given(up=link_specs, down=link_specs, entries=arrivals, seed=st.integers(0, 2**32))
 def test_counters_say_what_the_records_and_the_ports_say(up, down, entries, seed):
+    up, down = (replace(spec, corruption=None) for spec in (up, down))  # each payload is its packet's number
     flight = fly(up, down, entries, seed)
     for way, counters in flight.relay.counters.items():
         bodies = [record.body for record in flight.records if record.topic == f"link/{way}"]
@@ -145,11 +159,15 @@ def test_counters_say_what_the_records_and_the_ports_say(up, down, entries, seed
 def test_records_come_in_time_order_and_fit_their_schema(up, down, entries):
     flight = fly(up, down, entries)
     assert [r.t_ns for r in flight.records] == sorted(r.t_ns for r in flight.records)
-    for record in flight.records:
+    for record in of(flight, "up") + of(flight, "down"):
         body = record.body
-        assert body.keys() == set(SCHEMAS[record.topic]["required"])
+        assert body.keys() - {"bits"} == set(SCHEMAS[record.topic]["required"])
         assert body["sent_ns"] <= record.t_ns
         assert body["delivered_ns"] == (record.t_ns if body["fate"] == "delivered" else None)
+        if body["fate"] in ("lost", "refused"):
+            assert body["requested_ns"] is None
+        elif body["requested_ns"] is not None:
+            assert body["sent_ns"] + body["requested_ns"] == record.t_ns  # nobody is late here
 
 
 @given(
@@ -178,10 +196,7 @@ def test_with_a_gate_too_every_copy_is_accounted_for(up, down, delays, gaps):
     fates = [record.body["fate"] for record in of(flight, "down")]
     assert (fates.count("delivered"), fates.count("gated")) == (counters.delivered, counters.gated)
     assert len([port for _, port, _ in flight.left if port == "plant"]) == counters.delivered
-    assert all(
-        record.body.keys() == SCHEMAS["link/down"]["properties"].keys() | {"delivered_ns"}
-        for record in of(flight, "down")
-    )
+    assert all(record.body.keys() - {"bits"} == set(SCHEMAS["link/down"]["required"]) for record in of(flight, "down"))
     assert flight.relay.counters["up"].gated == 0
 
 
@@ -215,15 +230,25 @@ def test_a_command_leaves_when_the_gate_says_and_its_record_says_so():
     assert flight.relay.queued == {"up": 0, "down": 0}
 
 
-def test_what_the_gate_missed_is_recorded_at_most_once_a_second():
+def test_counters_and_what_the_gate_missed_are_recorded_once_a_second_while_packets_pass():
     flight = Flight(PERFECT, PERFECT, gate=Gate(WITNESS))
     wire = Wire(PLANT, AUTOPILOT)
     for k in range(200):
         number = wire.encode(NamedValueInt(25 * k, "SAMPLE_K", k))
         flight.send("plant", number + wire.encode(Attitude(25 * k, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)), 25 * k * MS)
+    flight.relay.close(6 * S)
+    flight.relay.close(8 * S)  # nothing has changed
+    flight.take(8 * S)
     events = [record for record in flight.records if record.topic == "events"]
-    assert [record.t_ns for record in events] == [n * S + 50 * MS for n in range(5)]
-    assert [record.body["data"] for record in events] == [{"gate": {"absent": 1 + 40 * n}} for n in range(5)]
+    assert [record.t_ns for record in events] == [1 * S, 2 * S, 3 * S, 4 * S, 6 * S]
+    links = [record.body["data"]["links"]["link"] for record in events]
+    assert [link["gate"] for link in links] == [{"absent": n} for n in (39, 79, 119, 159, 198)]
+    assert [link["up"]["sent"] for link in links] == [41, 81, 121, 161, 200]
+    assert links[-1]["up"] == asdict(flight.relay.counters["up"]) | {
+        "queued": 0,
+        "error_ns": {"p50": 0, "p99": 0, "max": 0},
+    }
+    assert links[-1]["down"]["error_ns"] is None
     assert all(record.body.keys() == SCHEMAS["events"]["properties"].keys() for record in events)
 
 
@@ -253,7 +278,10 @@ def test_a_perfect_link_passes_packets_on_at_once():
     assert relay.next_deadline_ns() is None
     (record,) = relay.records()
     assert record.t_ns == 7
-    assert record.body == {"sent_ns": 7, "delivered_ns": 7, "number": 1, "size": 1, "fate": "delivered", "copy": 0}
+    assert record.body == {
+        **{"sent_ns": 7, "delivered_ns": 7, "number": 1, "size": 1, "fate": "delivered", "copy": 0},
+        "requested_ns": 0,
+    }
 
 
 def test_a_packet_leaves_when_its_delay_has_elapsed_and_not_a_nanosecond_before():
@@ -409,7 +437,7 @@ def test_an_overloaded_serialiser_recovers_as_soon_as_its_queue_is_through():
 
 @given(up=link_specs, payload=st.binary(max_size=2000))
 def test_any_payload_passes_unchanged(up, payload):
-    flight = Flight(replace(up, loss=0.0, blackouts=()), PERFECT)
+    flight = Flight(replace(up, loss=0.0, blackouts=(), fading=None, corruption=None), PERFECT)
     flight.send("plant", payload, 0)
     flight.finish()
     assert {left for _, _, left in flight.left} == {payload}

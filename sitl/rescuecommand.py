@@ -8,7 +8,7 @@ from pathlib import Path
 import click
 
 from gains.command import NEGATIVE, SUCCESS, print_json
-from sitl.recover import Rescue, recover
+from sitl.rescue import Rescue, recover
 
 __all__ = ["recover_command"]
 

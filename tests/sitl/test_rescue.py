@@ -29,8 +29,8 @@ from gains.table import InputError
 from sitl import mcapwalk
 from sitl.flight import fly_virtual
 from sitl.recorder import FlightRecorder
-from sitl.recover import Rescue, recover
-from sitl.recovercommand import recover_command
+from sitl.rescue import Rescue, recover
+from sitl.rescuecommand import recover_command
 from sitl.scenario import load_scenario
 
 MB = 1 << 20
@@ -375,14 +375,14 @@ def test_a_bomb_costs_no_memory(cut, monkeypatch):
 
 
 def test_endless_definitions_metadata_and_index_entries_have_bounds(cut, monkeypatch):
-    monkeypatch.setattr("sitl.recover.MAX_DEFINITIONS", 10)
-    monkeypatch.setattr("sitl.recover.MAX_EXTRAS", 10)
+    monkeypatch.setattr("sitl.rescue.MAX_DEFINITIONS", 10)
+    monkeypatch.setattr("sitl.rescue.MAX_EXTRAS", 10)
     channels = [record(CHANNEL, struct.pack("<HH", i, 0) + text(b"a") + text(b"") * 2) for i in range(2, 100)]
     metadata = [record(METADATA, text(b"") * 2)] * 100
     rescue, _ = cut(GOOD + b"".join(channels + metadata) + A_MESSAGE)
     assert (rescue.messages, rescue.metadata, rescue.dropped_records) == (2, 10, 98 - 9 + 90)
-    monkeypatch.setattr("sitl.recover.MAX_INDEX_ENTRIES", 6)
-    monkeypatch.setattr("sitl.recover.CHUNK_BYTES", 1)
+    monkeypatch.setattr("sitl.rescue.MAX_INDEX_ENTRIES", 6)
+    monkeypatch.setattr("sitl.rescue.CHUNK_BYTES", 1)
     rescue, target = cut(GOOD + A_MESSAGE * 9)
     assert (rescue.messages, rescue.bytes_dropped) == (3, 7 * len(A_MESSAGE))
     assert len(messages_of(target)) == 3
