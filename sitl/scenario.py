@@ -35,9 +35,9 @@ from sitl.link.presets import parse_link
 from sitl.link.relay import RelayNode
 from sitl.link.spec import format_spec
 from sitl.plant import PlantConfig, PlantNode
+from sitl.seeds import MAX_SEED
 
 __all__ = [
-    "MAX_SEED",
     "Check",
     "Scenario",
     "autopilot_arguments",
@@ -53,9 +53,6 @@ DEFAULT_CLOCKS: Mapping[str, str] = {
     "autopilot": "1042s:-60ppm",
 }
 """No two clocks agree unless a scenario says so: mixed-up clocks fail at once."""
-
-MAX_SEED = 2**63 - 1
-"""Largest seed: it fits the integers of a summary."""
 
 LINK_COUNTS = ("sent", "delivered", "lost", "duplicated", "reordered")
 

@@ -373,10 +373,10 @@ class Impairment:
         else:
             return None
         if slots is not None:
-            if follows and begin_ns == ready_ns:
-                self._in_slot += 1
-            else:
-                self._slot, self._in_slot = begin_ns // slots.period_ns, 1
+            slot, since_ns = divmod(begin_ns, slots.period_ns)
+            if since_ns == 0 and slot > self._slot:
+                self._slot, self._in_slot = slot, 0
+            self._in_slot += 1
         return begin_ns
 
     def _has_room(self, slots: Slots) -> bool:

@@ -11,6 +11,7 @@ import pytest
 from lxml import etree
 
 import sitl.__main__
+import sitl.scenario
 from gains.command import run
 from gains.table import InputError
 from sitl.junit import FLIGHT_CASE, MAX_PROPERTIES, write_junit
@@ -159,5 +160,5 @@ def test_a_flight_writes_it_and_a_folder_that_is_not_there_is_refused_before(
     assert not (tmp_path / "out").exists()
     fly(tmp_path / "report.xml")
     root = check_schema(tmp_path / "report.xml")
-    assert int(root.get("tests", "")) == 1 + 1 + len(sitl.__main__.load_scenario("nominal").checks)
+    assert int(root.get("tests", "")) == 1 + 1 + len(sitl.scenario.load_scenario("nominal").checks)
     assert {p.get("name"): p.get("value") for p in root.iter("property")}["samples"] == "20"

@@ -10,10 +10,10 @@ import click.testing
 import numpy as np
 import pytest
 
+from sitl.commands.links import links
 from sitl.link.impairment import MAX_QUEUED, Fate, Impairment, LinkSpec
 from sitl.link.presets import CATALOGUE, PRESETS, SOURCES, Quantity, parse_link, preset_table
 from sitl.link.spec import parse_spec
-from sitl.linkcommands import links
 from tests.sitl.links import MS, S
 
 PACKETS = 20_000

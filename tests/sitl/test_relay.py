@@ -279,7 +279,12 @@ def test_a_perfect_link_passes_packets_on_at_once():
     (record,) = relay.records()
     assert record.t_ns == 7
     assert record.body == {
-        **{"sent_ns": 7, "delivered_ns": 7, "number": 1, "size": 1, "fate": "delivered", "copy": 0},
+        "sent_ns": 7,
+        "delivered_ns": 7,
+        "number": 1,
+        "size": 1,
+        "fate": "delivered",
+        "copy": 0,
         "requested_ns": 0,
     }
 

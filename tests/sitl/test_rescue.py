@@ -27,10 +27,10 @@ from autopilot.link.record import read_mcap, read_metadata
 from gains.command import run
 from gains.table import InputError
 from sitl import mcapwalk
+from sitl.commands.recover import recover_command
 from sitl.flight import fly_virtual
 from sitl.recorder import FlightRecorder
 from sitl.rescue import Rescue, recover
-from sitl.rescuecommand import recover_command
 from sitl.scenario import load_scenario
 
 MB = 1 << 20

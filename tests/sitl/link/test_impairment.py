@@ -13,9 +13,6 @@ from scipy import stats
 
 from sitl.link.impairment import Copy, Fate, Impairment, LinkSpec
 from sitl.link.jitters import JITTERS
-from sitl.link.losses import LOSSES, GilbertElliott
-from sitl.link.relay import RelayNode
-from sitl.link.spec import parse_spec
 from tests.sitl.links import MS, SAMPLES, S, flights_ns, impairment
 
 

@@ -2,12 +2,27 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import click
 
 from gains.command import print_json
-from sitl.link.presets import SOURCES, preset_table
+from sitl.link.presets import PRESETS, SOURCES, preset_table
 
-__all__ = ["links"]
+__all__ = ["link_options", "links"]
+
+_LINK_OPTIONS = (
+    click.option("--link", "preset", type=click.Choice(sorted(PRESETS)), help="A link for both directions."),
+    click.option("--up", help="Plant to autopilot: delay=25ms,jitter=uniform:28ms,loss=0.1,... (README)."),
+    click.option("--down", help="Autopilot to plant, likewise."),
+)
+
+
+def link_options(command: Any) -> Any:
+    """Add ``--link``, ``--up`` and ``--down`` to a click command; it gets ``preset, up, down``."""
+    for option in reversed(_LINK_OPTIONS):
+        command = option(command)
+    return command
 
 
 @click.command()

@@ -1,0 +1,1 @@
+"""The subcommands of ``sitl``, a module each, loaded when it is called."""
