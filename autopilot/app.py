@@ -50,6 +50,8 @@ __all__ = ["AutopilotNode"]
 
 PLANT_PORT = "plant"
 HEARTBEAT_NS = NS_PER_S
+SILENT_HEARTBEAT_NS = NS_PER_S // 5
+"""While no samples come: a plant that starts again waits for a heartbeat."""
 TIMESYNC_START_NS = 50 * NS_PER_MS
 TIMESYNC_NS = 100 * NS_PER_MS
 SYNC_WAIT_NS = 2 * NS_PER_S
@@ -374,6 +376,8 @@ class AutopilotNode:
             starting = self._next_heartbeat_ns is None
             self._next_timesync_ns = now_ns + (TIMESYNC_START_NS if starting else TIMESYNC_NS)
             self._send(Timesync(0, self.clock.request(now_ns)))
+        if self._next_heartbeat_ns is not None and self.pilot.is_stale(now_ns):
+            self._next_heartbeat_ns = min(self._next_heartbeat_ns, now_ns + SILENT_HEARTBEAT_NS)
         if self._next_heartbeat_ns is not None and now_ns >= self._next_heartbeat_ns:
             self._next_heartbeat_ns = following(self._next_heartbeat_ns, HEARTBEAT_NS, now_ns)
             mode = self.commander.mode

@@ -229,7 +229,7 @@ class Pilot:
             Own time.
         """
         was = self.mode
-        if self._stale_ns is not None and now_ns > self._stale_ns:
+        if self.is_stale(now_ns):
             self.event(Event.STALE, "a gap before this sample", now_ns)
         if self._clock_known and not clock_known:
             self.event(Event.CLOCK_LOST, "plant clock lost", now_ns)
@@ -476,6 +476,10 @@ class Pilot:
         self.saturation.told(saturated=False, now_ns=now_ns)
         self._next_repeat_ns = now_ns + self._Ts_ns
         return True
+
+    def is_stale(self, now_ns: int) -> bool:
+        """Return whether samples have come, and none for longer than the state may be old."""
+        return self._stale_ns is not None and now_ns > self._stale_ns
 
     @property
     def silent(self) -> bool:

@@ -1,9 +1,10 @@
-"""Impairment against scipy's distributions, the algebra of Markov chains, and exact schedules."""
+"""Impairment against scipy's distributions, queueing theory, netem's rules, and exact schedules."""
 
 from __future__ import annotations
 
 import itertools
 import math
+from collections import deque
 
 import numpy as np
 import pytest
@@ -12,7 +13,8 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from sitl.link.impairment import Copy, Fate, Impairment, LinkSpec
-from sitl.link.jitters import JITTERS
+from sitl.link.jitters import NormalJitter
+from sitl.link.traces import Trace
 from tests.sitl.links import MS, SAMPLES, S, flights_ns, impairment
 
 
@@ -37,18 +39,6 @@ def is_sorted(instants: list[int]) -> bool:
 )
 def test_jitter_follows_its_distribution(spec, distribution):
     assert stats.kstest(flights_ns(spec), distribution.cdf).pvalue > 1e-3
-
-
-def test_every_jitter_model_has_a_distribution_test():
-    assert set(JITTERS) == {"uniform", "normal", "gamma"}
-
-
-def test_gamma_jitter_has_shape_2_and_the_mean_given():
-    samples = flights_ns("jitter=gamma:20ms")
-    shape, _, scale = stats.gamma.fit(samples, floc=0)
-    assert shape == pytest.approx(2.0, rel=0.03)
-    assert shape * scale == pytest.approx(20 * MS, rel=0.02)
-    assert samples.mean() == pytest.approx(20 * MS, rel=0.02)
 
 
 def test_uniform_jitter_stays_within_its_width():
@@ -145,10 +135,161 @@ def test_a_reordered_packet_does_not_wait_for_the_serialiser():
 
 @pytest.mark.parametrize("room", [0, 1])
 def test_refused_copies_take_no_airtime(room):
-    link = impairment("rate=80kbps,dup=1")
-    copies = [link.step(50, 0, room) for _ in range(100)]
+    link = impairment("rate=80kbps,dup=1,limit=7")
+    copies = [link.step(50, 0, 7 - room) for _ in range(100)]
     assert all([copy.fate for copy in pair].count(Fate.REFUSED) == 2 - room for pair in copies)
     assert link.schedule(50, 0)[0] == (room * 100 + 1) * 5 * MS
+
+
+def poisson_ns(load: float, service_ns: int, packets: int, seed: int) -> list[int]:
+    """Return when packets enter that come as a Poisson process."""
+    gaps = np.random.default_rng(seed).exponential(service_ns / load, packets)
+    return np.cumsum(gaps).astype(np.int64).tolist()
+
+
+@pytest.mark.parametrize("load", [0.3, 0.7])
+def test_the_mean_wait_at_a_rate_is_that_of_pollaczek_and_khinchine(load):
+    service_ns = MS
+    link = impairment("rate=800kbps")
+    entries = poisson_ns(load, service_ns, 100_000, 3)
+    waits = np.array([link.schedule(100, entry)[0] - entry - service_ns for entry in entries], dtype=float)
+    expected = load * service_ns / (2.0 * (1.0 - load))  # M/D/1
+    blocks = waits.reshape(-1, 1000).mean(axis=1)
+    assert waits.mean() == pytest.approx(expected, abs=4.0 * blocks.std() / math.sqrt(len(blocks)))
+    assert np.mean(waits == 0.0) == pytest.approx(1.0 - load, abs=0.02)
+
+
+def refusals(load: float, limit: int, packets: int = 30_000) -> tuple[list[bool], list[bool]]:
+    """Return which packets a limited link refuses, and which a queue refuses that counts who is in the system."""
+    service_ns = MS
+    link = impairment(f"rate=800kbps,limit={limit}")
+    refused, expected, under_way, system = [], [], [], deque[int]()
+    for entry in poisson_ns(load, service_ns, packets, 4):
+        under_way = [exit_ns for exit_ns in under_way if exit_ns > entry]
+        copy = link.step(100, entry, len(under_way))[0]
+        refused.append(copy.fate is Fate.REFUSED)
+        if copy.fate is Fate.DELIVERED:
+            under_way.append(copy.exit_ns)
+        while system and system[0] <= entry:
+            system.popleft()
+        expected.append(len(system) >= limit)
+        if not expected[-1]:
+            system.append(max(system[-1] if system else 0, entry) + service_ns)
+    return refused, expected
+
+
+@pytest.mark.parametrize(("load", "limit"), [(0.7, 2), (0.95, 5), (3.0, 60)])
+def test_the_limit_refuses_what_finds_the_queue_full(load, limit):
+    refused, expected = refusals(load, limit)
+    assert refused == expected
+    assert sum(refused) > 100
+
+
+def test_a_link_that_holds_one_packet_refuses_as_erlang_says():
+    refused, _ = refusals(0.7, 1)
+    assert accepts(sum(refused), len(refused), 0.7 / 1.7)
+
+
+# ------------------------------------------------------------------------------------------------- delay
+
+
+def test_delay_jitter_and_trace_are_below_0_only_together():
+    trace = Trace("", (10 * MS,))
+    samples = np.array(
+        [
+            Impairment(LinkSpec(jitter=NormalJitter(20 * MS), trace=trace), np.random.default_rng(seed)).schedule(60, 0)
+            for seed in range(2000)
+        ],
+        dtype=float,
+    )
+    assert accepts(int((samples == 0.0).sum()), len(samples), float(stats.norm.cdf(-0.5)))
+
+
+def test_a_trace_without_times_gives_each_packet_the_next_entry_lost_or_not_and_begins_anew():
+    trace = Trace("", (5 * MS, None, 7 * MS))
+    link = Impairment(LinkSpec(delay_ns=MS, loss=0.5, trace=trace), np.random.default_rng(2))
+    plain = impairment("loss=0.5", seed=2)
+    for n in range(300):
+        (copy,), entry = link.step(60, n * S), trace.delays_ns[n % 3]
+        lost = plain.step(60, n * S)[0].fate is Fate.LOST
+        assert copy == (Copy(Fate.LOST, n * S) if lost or entry is None else Copy("delivered", n * S + MS + entry))
+
+
+def test_a_trace_with_times_gives_a_packet_the_last_entry_not_after_it_and_begins_anew():
+    trace = Trace("", (1, None, 3), (0, 10, 25), 40)
+    link = Impairment(LinkSpec(trace=trace), np.random.default_rng(0))
+    expected = ([1] * 10 + [None] * 15 + [3] * 15) * 3
+    assert [(link.schedule(60, t) or (None,))[0] for t in range(120)] == [
+        None if delay is None else t + delay for t, delay in enumerate(expected)
+    ]
+
+
+# ------------------------------------------------------------------------------------------ reordering
+
+
+def overtaken(values: np.ndarray, probability: float, gap: int) -> list[bool]:
+    """Return which packets overtake by the rule of ``netem_enqueue``, given the random number of each."""
+    counter, out = 0, []
+    for value in values:
+        queue_it = counter < gap - 1 or value >= probability
+        counter = counter + 1 if queue_it else 0
+        out.append(not queue_it)
+    return out
+
+
+@pytest.mark.parametrize("probability", [0.0, 0.2, 0.9, 1.0])
+@pytest.mark.parametrize("gap", [1, 2, 5, 100])
+def test_reordering_with_a_gap_follows_the_rule_of_netem(probability, gap):
+    link = impairment(f"delay=50ms,reorder={probability},gap={gap}", seed=8)
+    values = np.random.default_rng(8).spawn(6)[2].random(3000)
+    found = [link.schedule(60, n * MS)[0] == n * MS for n in range(3000)]
+    assert found == overtaken(values, probability, gap)
+
+
+def test_packets_between_two_that_overtake_are_the_gap_and_a_geometric_number_more():
+    link = impairment("delay=50ms,reorder=0.3,gap=4")
+    places = np.flatnonzero([link.schedule(60, n * MS)[0] == n * MS for n in range(40_000)])
+    beyond = np.diff(places) - 3
+    found = np.bincount(np.minimum(beyond, 10))[1:]
+    assert beyond.min() == 1
+    expected = len(beyond) * np.append(stats.geom.pmf(np.arange(1, 10), 0.3), stats.geom.sf(9, 0.3))
+    assert stats.chisquare(found, expected).pvalue > 1e-3
+
+
+def test_a_copy_that_is_refused_does_not_count_for_the_gap():
+    link = impairment("delay=50ms,reorder=1,gap=3,limit=1")
+    assert [link.step(60, 0)[0].exit_ns for _ in range(2)] == [50 * MS] * 2
+    assert link.step(60, 0, 1)[0].fate is Fate.REFUSED
+    assert [link.step(60, 0)[0].exit_ns for _ in range(2)] == [0, 50 * MS]
+
+
+# ------------------------------------------------------------------------------------------ corruption
+
+
+def test_corruption_hits_as_often_as_asked_and_flips_bits_anywhere():
+    link, size = impairment("corrupt=0.2:3"), 7
+    flipped = [link.step(size, n)[0].flipped for n in range(50_000)]
+    hits = [bits for bits in flipped if bits]
+    assert accepts(len(hits), len(flipped), 0.2)
+    assert {len(bits) for bits in hits} == {3}
+    counts = np.bincount(np.ravel(hits), minlength=8 * size)
+    assert len(counts) == 8 * size
+    assert stats.chisquare(counts).pvalue > 1e-3
+
+
+@pytest.mark.parametrize("size", [0, 1, 65_535])
+def test_flipped_bits_are_bits_of_the_packet(size):
+    link = impairment("corrupt=1:100")
+    flipped = link.step(size, 0)[0].flipped
+    assert len(flipped) == (100 if size else 0)
+    assert all(0 <= bit < 8 * size for bit in flipped)
+
+
+def test_the_two_copies_of_a_duplicate_are_hit_independently():
+    link = impairment("dup=1,corrupt=0.5")
+    hits = np.array([[bool(copy.flipped) for copy in link.step(10, n)] for n in range(20_000)], dtype=float)
+    assert accepts(int(hits.sum()), hits.size, 0.5)
+    assert abs(np.corrcoef(hits.T)[0, 1]) < 4.0 / math.sqrt(len(hits))
 
 
 # ------------------------------------------------------------------------------------------------ order
@@ -181,72 +322,6 @@ def test_no_packet_leaves_before_it_enters(seed, text, entries):
     assert all(instant >= entry for entry in entries for instant in link.schedule(60, entry))
 
 
-# ---------------------------------------------------------------------------------------------- streams
-
-
-@pytest.mark.parametrize("loss", ["0.1", "ge:0.02:0.18:0.9:0.01"])
-def test_same_seed_gives_the_same_schedule_and_another_seed_another(loss):
-    text = f"delay=5ms,jitter=gamma:28ms,loss={loss},dup=0.1,reorder=0.1"
-    one, same, other = (
-        [link.schedule(60, n * MS) for n in range(500)]
-        for link in (impairment(text, 7), impairment(text, 7), impairment(text, 8))
-    )
-    assert one == same
-    assert one != other
-
-
-@pytest.mark.parametrize("jitter", ["uniform:28ms", "normal:4ms", "gamma:20ms"])
-@pytest.mark.parametrize("added", ["loss=0.2", "loss=ge:0.05:0.2", "dup=0.5", "reorder=0.1", "blackout=2s:3s"])
-def test_adding_a_feature_leaves_the_jitter_of_each_packet_as_it_was(jitter, added):
-    base = f"delay=40ms,jitter={jitter}"
-    plain, impaired = impairment(base), impairment(f"{base},{added}")
-    kept = 0
-    for entry in range(0, 10 * S, 10 * MS):
-        (expected,), found = plain.schedule(60, entry), impaired.schedule(60, entry)
-        kept += bool(found) and found[0] == expected
-        assert not found or found[0] in (expected, entry)  # entry: it overtook
-    assert 500 < kept < 1000 or (added.startswith("dup") and kept == 1000)
-
-
-@pytest.mark.parametrize(
-    ("low", "high"),
-    [
-        ("0.1", "0.3"),
-        ("ge:0.02:0.2", "ge:0.05:0.2"),  # more bursts
-        ("ge:0.02:0.2", "ge:0.02:0.1"),  # longer ones
-        ("ge:0.02:0.2:0.5", "ge:0.02:0.2:0.7:0.1"),  # the same, with more loss
-    ],
-)
-def test_packets_lost_at_a_low_rate_are_lost_at_a_high_rate(low, high):
-    at_low, at_high = losses(f"loss={low}", 5000), losses(f"loss={high}", 5000)
-    assert (at_high >= at_low).all()
-    assert at_high.sum() > at_low.sum() > 100
-
-
-@pytest.mark.parametrize(
-    "added", ["delay=5ms", "dup=0.3", "reorder=0.1", "jitter=gamma:1ms", "rate=9600bps,order=keep"]
-)
-def test_adding_a_feature_leaves_the_bursts_as_they_were(added):
-    bursty = "loss=ge:0.02:0.18:0.9:0.01"
-    assert (losses(bursty, 5000) == losses(f"{bursty},{added}", 5000)).all()
-
-
-def test_a_blackout_leaves_the_bursts_after_it_as_they_were():
-    plain, out = impairment("loss=ge:0.05:0.2"), impairment("loss=ge:0.05:0.2,blackout=1s:1s")
-    fates = [(plain.step(60, n * MS)[0].fate, out.step(60, n * MS)[0].fate) for n in range(3000)]
-    assert fates[:1000] + fates[2000:] == [(a, a) for a, _ in fates[:1000] + fates[2000:]]
-    assert {fate for _, fate in fates[1000:2000]} == {Fate.LOST, Fate.BLACKOUT}
-
-
-@pytest.mark.parametrize("loss", ["0.2", "ge:0.05:0.2"])
-def test_entry_times_and_sizes_do_not_change_the_draws(loss):
-    text = f"delay=5ms,jitter=uniform:28ms,loss={loss},dup=0.2"
-    dense, sparse = impairment(text), impairment(text)
-    for n in range(500):
-        at_ns = n * S
-        assert [t - n for t in dense.schedule(10, n)] == [t - at_ns for t in sparse.schedule(900, at_ns)]
-
-
 # -------------------------------------------------------------------------------------------- blackouts
 
 
@@ -265,3 +340,21 @@ def test_a_blackout_drops_what_would_leave_during_it():
     assert copies[1].exit_ns == S  # in flight until it would have left
     assert copies[2].exit_ns == 2 * S - 1  # never taken
     assert link.schedule(60, 2 * S) == (2 * S + 100 * MS,)
+
+
+# ---------------------------------------------------------------------------------------------- changes
+
+
+def test_after_a_change_packets_wait_for_what_the_serialiser_still_sends():
+    before = impairment("rate=80kbps")
+    assert before.schedule(50, 0) == (5 * MS,)
+    assert Impairment(LinkSpec(rate_bps=800_000), np.random.default_rng(0), before).schedule(50, 0) == (5500_000,)
+    assert Impairment(LinkSpec(), np.random.default_rng(0), before).schedule(50, 0) == (0,)  # nothing to wait for
+
+
+@pytest.mark.parametrize("order", ["", ",order=keep"])
+def test_after_a_change_to_order_keep_no_packet_leaves_before_those_of_before(order):
+    before = impairment(f"delay=50ms{order}")
+    before.schedule(50, 0)
+    changed = Impairment(LinkSpec(delay_ns=MS, keep_order=True), np.random.default_rng(0), before)
+    assert changed.schedule(50, 1) == (50 * MS,)
