@@ -62,7 +62,7 @@ def virtual_network(
     plant = scenario.plant_node()
     nodes: dict[str, Node] = {
         "plant": plant,
-        "relay": scenario.relay_node(),
+        "relay": scenario.relay_node() if write is not None else scenario.relay_node(log_rate=0),
         "autopilot": scenario.autopilot_node(ground_stations),
     }
     participants = [

@@ -32,7 +32,7 @@ from sitl.faults import Fault, aircraft_faults, check_faults, format_fault, pars
 from sitl.link.gate import Gate, check_flyable
 from sitl.link.impairment import LinkSpec
 from sitl.link.presets import parse_link
-from sitl.link.relay import RelayNode
+from sitl.link.relay import DEFAULT_LOG_RATE, RelayNode
 from sitl.link.spec import format_spec
 from sitl.plant import PlantConfig, PlantNode
 from sitl.seeds import MAX_SEED
@@ -229,9 +229,10 @@ class Scenario:
             )
         )
 
-    def relay_node(self) -> RelayNode:
-        """Return the relay, new."""
-        return RelayNode(self.up, self.down, self.seed, None if self.witness is None else Gate(self.witness))
+    def relay_node(self, *, log_rate: int = DEFAULT_LOG_RATE) -> RelayNode:
+        """Return the relay, new, which records at most so many packets a second."""
+        gate = None if self.witness is None else Gate(self.witness)
+        return RelayNode(self.up, self.down, self.seed, gate, log_rate=log_rate)
 
     def autopilot_node(self, ground_stations: int) -> AutopilotNode:
         """Return the autopilot, new."""

@@ -119,7 +119,7 @@ class VirtualNetwork:
     # What may happen to a node
 
     def replace(self, name: str, node: Node, clock: Clock) -> None:
-        """Boot a new node under an old name, as after a crash: datagrams under way still arrive."""
+        """Boot a new node under an old name: it takes what waits for a frozen one; of a dead one nothing waits."""
         i = self._index[name]
         self._participants[i] = Participant(name, node, clock, self._participants[i].max_waiting)
         self._states[i] = _State()
@@ -170,10 +170,11 @@ class VirtualNetwork:
     # Events
 
     def run(self, until: Callable[[], bool], limit_ns: int) -> None:
-        """Fly until ``until()`` holds or true time passes ``limit_ns``."""
-        while not until():
-            if self._deliver():
-                continue
+        """Fly until ``until()`` holds, asked before each tick, or true time passes ``limit_ns``."""
+        while True:
+            self._deliver()
+            if until():
+                return
             i = self._earliest()
             due_ns = self._due[i]
             if due_ns is None or due_ns > limit_ns:
@@ -184,18 +185,21 @@ class VirtualNetwork:
             p.node.tick(p.clock.node_ns(self.now_ns))
             self._collect(i)
 
-    def _deliver(self) -> bool:
-        """Hand over what is under way to the first node that has something; wires take no time."""
-        for i, waiting in enumerate(self._deliveries):
-            if waiting and not self._states[i].frozen:
-                port, datagram = waiting.popleft()
-                p = self._participants[i]
-                if self._tapped[i]:
-                    self._tap(p.name, port, "received", datagram, self.now_ns)  # type: ignore[misc]
-                p.node.receive(port, datagram, p.clock.node_ns(self.now_ns))
-                self._collect(i)
-                return True
-        return False
+    def _deliver(self) -> None:
+        """Hand over what is under way, always to the first node that has something; wires take no time."""
+        i, count = 0, len(self._participants)
+        while i < count:
+            waiting = self._deliveries[i]
+            if not waiting or self._states[i].frozen:
+                i += 1
+                continue
+            port, datagram = waiting.popleft()
+            p = self._participants[i]
+            if self._tapped[i]:
+                self._tap(p.name, port, "received", datagram, self.now_ns)  # type: ignore[misc]
+            p.node.receive(port, datagram, p.clock.node_ns(self.now_ns))
+            if self._collect(i):
+                i = 0
 
     def _deliver_to(self, i: int, port: str, datagram: bytes) -> None:
         """Put a datagram before a node, if there is one, and room."""
@@ -225,10 +229,11 @@ class VirtualNetwork:
             self._deadlines[i] = deadline_ns
             self._due[i] = None if deadline_ns is None else p.clock.true_ns(deadline_ns)
 
-    def _collect(self, i: int) -> None:
-        """Take what a node has sent and recorded, and its new deadline."""
+    def _collect(self, i: int) -> bool:
+        """Take what a node has sent and recorded, and its new deadline; return whether it sent anything."""
         p = self._participants[i]
-        for port, datagram in p.node.outgoing():
+        outgoing = p.node.outgoing()
+        for port, datagram in outgoing:
             if self._states[i].mute:
                 self.losses[p.name][Loss.MUTE] += 1
                 continue
@@ -242,3 +247,4 @@ class VirtualNetwork:
             for record in records:
                 self._sink(record, p.clock.true_ns(record.t_ns))
         self._schedule(i)
+        return bool(outgoing)

@@ -23,6 +23,7 @@ from sitl.link.presets import parse_link
 from sitl.link.rules import Way
 
 __all__ = [
+    "DEFAULT_CONTROL",
     "MAX_REPLY_BYTES",
     "MAX_REQUEST_BYTES",
     "Refused",
@@ -35,6 +36,9 @@ __all__ = [
     "encode_reply",
     "encode_request",
 ]
+
+DEFAULT_CONTROL = "127.0.0.1:14602"
+"""Where a relay takes requests that is not told another address, and where they are sent."""
 
 MAX_REQUEST_BYTES = 4096
 MAX_REPLY_BYTES = 60_000

@@ -148,8 +148,10 @@ class Direction:
     counters : Counters
     newest : int
         The number of the latest-entered packet of which a copy has left.
+    came_ns : int
+        When the latest packet came, link time: below 0 where that was before the link's first packet was read.
     entered_ns : int
-        When the latest packet entered, link time; -1 before the first.
+        When it entered, from 0; -1 before the first.
     queued : int
         Copies under way, of all lanes.
     changes : list of Change
@@ -168,6 +170,7 @@ class Direction:
         "_find",
         "_index",
         "_seed",
+        "came_ns",
         "changed",
         "changes",
         "counters",
@@ -201,6 +204,7 @@ class Direction:
         self.counters = Counters()
         self.queued = 0
         self.newest = 0
+        self.came_ns = -_NEVER_NS
         self.entered_ns = -1
         self.errors = Histogram()
         self.latest: deque[Delivery] = deque(maxlen=LATEST)

@@ -221,8 +221,9 @@ class Impairment:
     rng : numpy.random.Generator
         Where its streams are spawned from; none of its own values is drawn.
     before : Impairment, optional
-        What the direction did until now: its last packets still occupy the serialiser, if there still is one, and the
-        slot, and with ``order=keep`` none leaves before them.
+        What the direction did until now: its last packets still occupy the serialiser, if there still is one, and with
+        ``order=keep`` none leaves before them. The loss, the trace, the radio's times, handovers and slots go on as
+        they would have, each where its part of the spec is the same; the rest begins anew.
     """
 
     def __init__(self, spec: LinkSpec, rng: np.random.Generator, before: Impairment | None = None) -> None:
@@ -251,10 +252,23 @@ class Impairment:
         self._last_exit_ns = 0
         """The latest instant at which a copy leaves."""
         if before is not None:
-            self._busy = before.free_ns * (spec.rate_bps or 1)
-            self._last_exit_ns = before._last_exit_ns
-            if before.spec.slots == spec.slots:
-                self._slot, self._in_slot = before._slot, before._in_slot
+            self._follow(before)
+
+    def _follow(self, before: Impairment) -> None:
+        """Take over from what the direction did until now."""
+        spec, last = self.spec, before.spec
+        self._busy = before.free_ns * (spec.rate_bps or 1)
+        self._last_exit_ns = before._last_exit_ns
+        if spec.slots == last.slots:
+            self._slot, self._in_slot = before._slot, before._in_slot
+        if spec.loss == last.loss:
+            self._lost = before._lost
+        if spec.trace == last.trace:
+            self._number = before._number
+        if spec.fading == last.fading:
+            self._bad_at, self._fading_lost = before._bad_at, before._fading_lost
+        if spec.handover == last.handover:
+            self._resume_ns = before._resume_ns
 
     @property
     def free_ns(self) -> int:

@@ -216,11 +216,11 @@ class Link:
                 link_ns = self._newest_ns
             if self._heap:
                 self._release()
-        elif direction.entered_ns < 0:
-            link_ns = max(0, link_ns)  # it may have come before the first of the other direction, which was read first
-        elif link_ns < direction.entered_ns:
-            self._set_back(direction.entered_ns - link_ns)
-            link_ns = direction.entered_ns
+        elif link_ns < direction.came_ns:
+            self._set_back(direction.came_ns - link_ns)
+            link_ns = direction.came_ns
+        direction.came_ns = link_ns
+        link_ns = max(0, link_ns)  # what came before the first of the other direction may be read after it
         direction.entered_ns = link_ns
         if link_ns > self._newest_ns:
             self._newest_ns = link_ns

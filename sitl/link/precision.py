@@ -43,7 +43,8 @@ class Histogram:
         self.count += 1
         if value_ns > self.largest_ns:
             self.largest_ns = value_ns
-            value_ns = min(value_ns, MAX_HELD_NS)
+        if value_ns > MAX_HELD_NS:
+            value_ns = MAX_HELD_NS
         shift = value_ns.bit_length() - _FINE_BITS - 1
         self._counts[value_ns if shift <= 0 else (shift << _FINE_BITS) + (value_ns >> shift)] += 1
 

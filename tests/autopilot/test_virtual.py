@@ -180,11 +180,12 @@ def test_the_tap_sees_both_ways_of_the_tapped_nodes_only():
     assert seen == [("a", "out", "sent", b"ping", 5), ("a", "in", "received", b"pong", 5)]
 
 
-def test_a_replaced_node_boots_on_its_new_clock_and_takes_what_is_under_way():
+def test_a_node_in_the_place_of_a_frozen_one_boots_on_its_new_clock_and_takes_what_waits():
     log = []
     a = Ticker("a", log, [10], [("out", b"late")])
     b = Ticker("b", log)
     net = network(log, a, b, wires={("a", "out"): ("b", "in")})
+    net.freeze("b")
     net.run(lambda: bool(log), S)
     fresh = Ticker("b", log, [500 + 7])
     net.replace("b", fresh, Clock(500, 0, net.now_ns))

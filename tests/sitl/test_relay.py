@@ -10,8 +10,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from autopilot.link.codecs import message_ids
 from autopilot.link.node import Node
-from autopilot.link.topics import SCHEMAS
+from autopilot.link.topics import SCHEMAS, is_topic
 from autopilot.link.wire import (
     AUTOPILOT,
     PLANT,
@@ -22,103 +23,35 @@ from autopilot.link.wire import (
     Wire,
 )
 from gains.witnessfile import Witness
+from sitl.link.changes import Change
+from sitl.link.direction import LinkConfig
 from sitl.link.gate import Gate
-from sitl.link.impairment import MAX_QUEUED, Corruption, LinkSpec
-from sitl.link.interruptions import Fading, Handover, Slots, Window
+from sitl.link.impairment import MAX_QUEUED
 from sitl.link.relay import Counters, RelayNode
+from sitl.link.rules import WAYS, Rule
 from sitl.link.spec import parse_spec
 from tests.helpers import HEARTBEAT
+from tests.sitl.relays import (
+    ENTRY,
+    EXIT,
+    MS,
+    PERFECT,
+    Flight,
+    S,
+    arrivals,
+    both_ways,
+    conserved,
+    events,
+    fly,
+    link_specs,
+    of,
+    short_times,
+)
 
-MS = 1_000_000
-S = 1_000_000_000
-PERFECT = LinkSpec()
 WITNESS = Witness("", "", 0.025, 1, 2, "fifo", 1.0, (2,))
-ENTRY = {"up": "plant", "down": "autopilot"}
-EXIT = {"up": "autopilot", "down": "plant"}
-
-
-class Flight:
-    """A relay driven as the virtual driver does: jump to each deadline, deliveries before ticks."""
-
-    def __init__(
-        self, up: str | LinkSpec, down: str | LinkSpec, seed: int = 1, gate: Gate | None = None, **more: Any
-    ) -> None:
-        up, down = (parse_spec(spec) if isinstance(spec, str) else spec for spec in (up, down))
-        self.relay = RelayNode(up, down, seed, gate, **more)
-        self.left: list[tuple[int, str, bytes]] = []
-        self.records = []
-
-    def take(self, now_ns: int) -> None:
-        self.left += [(now_ns, port, payload) for port, payload in self.relay.outgoing()]
-        self.records += self.relay.records()
-
-    def until(self, end_ns: int) -> None:
-        while (due_ns := self.relay.next_deadline_ns()) is not None and due_ns < end_ns:
-            self.relay.tick(due_ns)
-            self.take(due_ns)
-
-    def send(self, port: str, payload: bytes, now_ns: int) -> None:
-        self.until(now_ns)
-        self.relay.receive(port, payload, now_ns)
-        self.take(now_ns)
-
-    def finish(self) -> None:
-        self.until(1 << 62)
-
-
-def fly(up, down, entries, seed=1) -> Flight:
-    """Send (now_ns, port) in order, each payload its number, and let everything out."""
-    flight = Flight(up, down, seed)
-    for number, (now_ns, port) in enumerate(entries):
-        flight.send(port, number.to_bytes(4, "big"), now_ns)
-    flight.finish()
-    return flight
-
-
-def both_ways(count: int, gap_ns: int = 25 * MS) -> list[tuple[int, str]]:
-    return [(n * gap_ns, port) for n in range(count) for port in ("plant", "autopilot")]
-
-
-probabilities = st.sampled_from([0.0, 0.1, 0.5, 1.0])
-short_times = st.integers(0, 60).map(lambda ms: ms * MS)
-windows = st.lists(
-    st.builds(lambda start_ns, length_ns: Window(start_ns, length_ns, 0), short_times, short_times), max_size=2
-).map(tuple)
-link_specs = st.builds(
-    lambda spec, jitter: replace(spec, jitter=parse_spec(jitter).jitter),
-    st.builds(
-        LinkSpec,
-        delay_ns=short_times,
-        loss=probabilities,
-        dup=probabilities,
-        reorder=probabilities,
-        keep_order=st.booleans(),
-        rate_bps=st.none() | st.sampled_from([9600, 57_600]),
-        limit=st.sampled_from([1, 3, 10_000]),
-        corruption=st.none() | st.builds(Corruption, probabilities, st.integers(1, 9)),
-        slots=st.none() | st.builds(Slots, st.just(20 * MS), st.integers(0, 2)),
-        blackouts=windows,
-        holds=windows,
-        handover=st.none() | st.just(Handover(50 * MS, 30 * MS)),
-        fading=st.none() | st.just(Fading(40 * MS, 20 * MS, 30 * MS, 0.5)),
-    ),
-    st.sampled_from(["delay=0s", "jitter=uniform:28ms", "jitter=normal:9ms", "jitter=gamma:20ms"]),
-)
-arrivals = st.lists(st.tuples(short_times, st.sampled_from(["plant", "autopilot"])), max_size=40).map(
-    lambda gaps: [
-        (int(at_ns), port) for at_ns, (_, port) in zip(np.cumsum([gap for gap, _ in gaps]), gaps, strict=True)
-    ]
-)
 
 
 # ----------------------------------------------------------------------------------------- conservation
-
-
-def conserved(relay: RelayNode) -> bool:
-    return all(
-        c.sent + c.duplicated == c.delivered + c.lost + c.refused + c.gated + relay.queued[way]
-        for way, c in relay.counters.items()
-    )
 
 
 @given(up=link_specs, down=link_specs, entries=arrivals, seed=st.integers(0, 2**32), limit=st.integers(1, 10))
@@ -239,9 +172,9 @@ def test_counters_and_what_the_gate_missed_are_recorded_once_a_second_while_pack
     flight.relay.close(6 * S)
     flight.relay.close(8 * S)  # nothing has changed
     flight.take(8 * S)
-    events = [record for record in flight.records if record.topic == "events"]
-    assert [record.t_ns for record in events] == [1 * S, 2 * S, 3 * S, 4 * S, 6 * S]
-    links = [record.body["data"]["links"]["link"] for record in events]
+    told = events(flight, "counters")
+    assert [record.t_ns for record in told] == [1 * S, 2 * S, 3 * S, 4 * S, 6 * S]
+    links = [record.body["data"]["links"]["link"] for record in told]
     assert [link["gate"] for link in links] == [{"absent": n} for n in (39, 79, 119, 159, 198)]
     assert [link["up"]["sent"] for link in links] == [41, 81, 121, 161, 200]
     assert links[-1]["up"] == asdict(flight.relay.counters["up"]) | {
@@ -249,7 +182,7 @@ def test_counters_and_what_the_gate_missed_are_recorded_once_a_second_while_pack
         "error_ns": {"p50": 0, "p99": 0, "max": 0},
     }
     assert links[-1]["down"]["error_ns"] is None
-    assert all(record.body.keys() == SCHEMAS["events"]["properties"].keys() for record in events)
+    assert all(record.body.keys() == SCHEMAS["events"]["properties"].keys() for record in told)
 
 
 # ---------------------------------------------------------------------------------------- the direction
@@ -341,10 +274,6 @@ def test_same_seed_same_flight_and_another_seed_another():
     one, same, other = (fly(spec, spec, both_ways(300), seed) for seed in (4, 4, 5))
     assert (one.left, one.records) == (same.left, same.records)
     assert one.left != other.left
-
-
-def of(flight: Flight, way: str) -> list:
-    return [record for record in flight.records if record.topic == f"link/{way}"]
 
 
 @pytest.mark.parametrize("up", ["delay=0s", "loss=0.5,dup=0.5", "delay=1s,jitter=gamma:1s,rate=9600bps"])
@@ -453,3 +382,175 @@ def test_counters_taken_do_not_change_later():
     before = relay.counters
     relay.receive("plant", b"x", 0)
     assert before["up"] == Counters()
+
+
+# ------------------------------------------------------------------------------- rules, changes, stamps
+
+
+frames = st.sampled_from(
+    [b"packet", b""]
+    + [
+        Wire(PLANT, AUTOPILOT).encode(message)
+        for message in (Attitude(0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0), Timesync(0, 5), HEARTBEAT)
+    ]
+)
+rules = st.lists(
+    st.builds(
+        lambda way, messages, spec: Rule(way, messages, message_ids(messages.split("+")), spec),
+        st.sampled_from(WAYS),
+        st.sampled_from(["ATTITUDE", "TIMESYNC+ATTITUDE", "0"]),
+        link_specs,
+    ),
+    max_size=3,
+)
+changes = st.lists(st.builds(Change, short_times, st.sampled_from(WAYS), link_specs), max_size=3)
+
+
+@given(
+    specs=st.tuples(link_specs, link_specs),
+    rules=rules,
+    changes=changes,
+    packets=st.lists(st.tuples(short_times, short_times, st.sampled_from(["plant", "autopilot"]), frames), max_size=30),
+    stamped=st.booleans(),
+)
+def test_with_rules_changes_and_stamps_too_every_copy_is_accounted_for(specs, rules, changes, packets, stamped):
+    """Packets that are read late, each port's in order, as from two sockets of a program that was busy."""
+    flight = Flight(*specs, rules=rules, changes=changes, stamped=stamped)
+    came_ns = {"plant": 0, "autopilot": 0}
+    now_ns = 0
+    for gap_ns, late_ns, port, payload in packets:
+        now_ns = max(now_ns, came_ns[port]) + late_ns
+        came_ns[port] = min(came_ns[port] + gap_ns, now_ns)
+        flight.relay.receive(port, payload, came_ns[port] if stamped else now_ns)
+        assert conserved(flight.relay)
+        flight.relay.tick(now_ns)
+        flight.take(now_ns)
+        assert conserved(flight.relay)
+    flight.finish()
+    assert conserved(flight.relay)
+    assert flight.relay.queued == {"up": 0, "down": 0}
+    for way in WAYS:
+        bodies = [record.body for record in of(flight, way)]
+        numbers = {body["number"]: body["sent_ns"] for body in bodies}
+        entered_ns = [numbers[n] for n in sorted(numbers)]
+        assert entered_ns == sorted(entered_ns)
+        assert all(body["delivered_ns"] is None or body["delivered_ns"] >= body["sent_ns"] for body in bodies)
+        assert len(bodies) == sum(
+            getattr(flight.relay.counters[way], name) for name in ("delivered", "lost", "refused", "gated")
+        )
+    assert flight.relay._links[0].clock_steps == 0
+
+
+def test_a_packet_that_was_read_late_entered_when_it_came_and_leaves_when_that_is_told():
+    relay = RelayNode(parse_spec("delay=5ms"), PERFECT, 1, stamped=True)
+    relay.receive("plant", b"a", 10 * MS)
+    assert relay.next_deadline_ns() == 15 * MS
+    relay.tick(16 * MS)
+    relay.receive("autopilot", b"b", 9 * MS)  # it came before the first one, and was read after it
+    assert relay.outgoing() == [("autopilot", b"a")]
+    relay.tick(17 * MS)
+    assert relay.outgoing() == [("plant", b"b")]
+    late, early = (record.body for record in relay.records())
+    assert (late["sent_ns"], late["delivered_ns"], late["requested_ns"]) == (10 * MS, 16 * MS, 5 * MS)
+    assert (early["sent_ns"], early["delivered_ns"], early["requested_ns"]) == (10 * MS, 17 * MS, 0)
+
+
+@pytest.mark.parametrize("stamped", [False, True])
+def test_a_clock_that_is_set_back_neither_stops_the_link_nor_holds_packets(stamped):
+    flight = Flight("delay=5ms,order=keep,rate=57600bps", "delay=7ms", stamped=stamped)
+    now_ns = 100 * S
+    for n in range(40):
+        now_ns += 25 * MS - (50 * S if n == 20 else 0)
+        for port in ("plant", "autopilot"):
+            flight.relay.receive(port, b"x", now_ns)
+            flight.take(now_ns)
+        for due_ns in (now_ns + 6 * MS, now_ns + 10 * MS):
+            flight.relay.tick(due_ns)
+            flight.take(due_ns)
+    assert flight.relay.queued == {"up": 0, "down": 0}
+    delays = [record.body["delivered_ns"] - record.body["sent_ns"] for way in WAYS for record in of(flight, way)]
+    assert len(delays) == 80
+    assert all(5 * MS <= delay_ns <= 10 * MS for delay_ns in delays)
+
+
+def test_no_more_packets_are_recorded_in_a_second_than_asked_for_and_the_others_are_counted():
+    flight = Flight(PERFECT, PERFECT, log_rate=10)
+    for n in range(250):
+        flight.send("plant", b"x", n * 10 * MS)
+    assert [record.body["number"] for record in of(flight, "up")] == [
+        *range(1, 11),
+        *range(101, 111),
+        *range(201, 211),
+    ]
+    assert flight.relay.counters["up"].unlogged == 220
+    assert flight.relay.counters["up"].delivered == 250
+
+
+def test_the_bits_that_were_flipped_are_recorded():
+    flight = Flight("corrupt=1:3", PERFECT)
+    flight.send("plant", bytes(20), 0)
+    ((_, _, payload),) = flight.left
+    (record,) = of(flight, "up")
+    flipped = {8 * place + bit for place in range(20) for bit in range(8) if payload[place] >> bit & 1}
+    assert flipped == {bit for bit in record.body["bits"] if record.body["bits"].count(bit) % 2}
+    assert len(record.body["bits"]) == 3
+
+
+def test_counters_say_how_far_delays_were_from_those_asked_for():
+    relay = RelayNode(parse_spec("delay=20ms"), PERFECT, 1)
+    for n in range(100):
+        relay.receive("plant", b"x", n * 30 * MS)
+        relay.tick(n * 30 * MS + 20 * MS + n * 10)
+    relay.close(4 * S)
+    data = relay.records()[-1].body["data"]
+    error_ns = data["links"]["link"]["up"]["error_ns"]
+    assert error_ns["max"] == 990
+    assert 490 <= error_ns["p50"] <= 490 * 33 / 32
+    assert 980 <= error_ns["p99"] <= 990
+
+
+# --------------------------------------------------------------------------------------- several links
+
+
+def two_links(**more: Any) -> RelayNode:
+    slow, lossy = (parse_spec(text) for text in ("delay=5ms", "loss=1"))
+    return RelayNode.joining([LinkConfig(slow, slow, 1, "one"), LinkConfig(lossy, PERFECT, 2, "two")], **more)
+
+
+def test_several_links_have_their_own_ports_topics_and_beginnings():
+    relay = two_links()
+    relay.receive("one/plant", b"a", 0)
+    relay.receive("two/autopilot", b"b", 1 * MS)
+    relay.receive("two/plant", b"c", 2 * MS)
+    assert relay.outgoing() == [("two/plant", b"b")]
+    assert relay.next_deadline_ns() == 5 * MS
+    relay.tick(5 * MS)
+    assert relay.outgoing() == [("one/autopilot", b"a")]
+    records = relay.records()
+    assert [record.topic for record in records] == ["link/two/down", "link/two/up", "link/one/up"]
+    assert all(is_topic(record.topic) for record in records)
+    assert {name: c.sent for name, c in relay.counters.items()} == {
+        "one/up": 1,
+        "one/down": 0,
+        "two/up": 1,
+        "two/down": 1,
+    }
+
+
+def test_a_link_does_the_same_beside_others_as_alone():
+    spec = parse_spec("delay=5ms,jitter=uniform:28ms,loss=0.1,dup=0.1")
+    alone = RelayNode(spec, spec, 7)
+    beside = RelayNode.joining([LinkConfig(PERFECT, PERFECT, 7, "first"), LinkConfig(spec, spec, 7, "second")])
+    for n in range(200):
+        beside.receive("first/plant", b"x", n * 10 * MS + 1)
+        for relay, prefix in ((alone, ""), (beside, "second/")):
+            relay.receive(f"{prefix}plant", n.to_bytes(2, "big"), n * 10 * MS + 5)
+    for relay in (alone, beside):
+        relay.tick(9 * S)
+    bodies = [
+        [record.body for record in relay.records() if record.topic == topic]
+        for relay, topic in ((alone, "link/up"), (beside, "link/second/up"))
+    ]
+    assert len(bodies[0]) > 200
+    strip = [[{**body, "delivered_ns": body["fate"]} for body in each] for each in bodies]
+    assert strip[0] == strip[1]

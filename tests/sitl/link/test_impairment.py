@@ -13,7 +13,9 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from sitl.link.impairment import Copy, Fate, Impairment, LinkSpec
+from sitl.link.interruptions import Window
 from sitl.link.jitters import NormalJitter
+from sitl.link.spec import parse_spec
 from sitl.link.traces import Trace
 from tests.sitl.links import MS, SAMPLES, S, flights_ns, impairment
 
@@ -106,9 +108,10 @@ def test_plain_loss_compares_one_value_a_packet_of_the_first_stream_with_its_pro
     sizes=st.lists(st.integers(0, 1500), min_size=1, max_size=50),
     rate_bps=st.integers(1, 10**9),
     delay_ns=st.integers(0, S),
+    holds=st.sampled_from([(), (Window(10**18, S),)]),  # also where the link may pause, but does not
 )
-def test_back_to_back_packets_are_spaced_by_their_serialisation(sizes, rate_bps, delay_ns):
-    link = Impairment(LinkSpec(delay_ns=delay_ns, rate_bps=rate_bps), np.random.default_rng(0))
+def test_back_to_back_packets_are_spaced_by_their_serialisation(sizes, rate_bps, delay_ns, holds):
+    link = Impairment(LinkSpec(delay_ns=delay_ns, rate_bps=rate_bps, holds=holds), np.random.default_rng(0))
     exits = [link.schedule(size, 0)[0] - delay_ns for size in sizes]
     # exact: the n-th packet is through when all bits up to its last are, rounded up to a whole ns
     assert exits == [-(-8 * S * int(total) // rate_bps) for total in np.cumsum(sizes)]
@@ -358,3 +361,35 @@ def test_after_a_change_to_order_keep_no_packet_leaves_before_those_of_before(or
     before.schedule(50, 0)
     changed = Impairment(LinkSpec(delay_ns=MS, keep_order=True), np.random.default_rng(0), before)
     assert changed.schedule(50, 1) == (50 * MS,)
+
+
+@pytest.mark.parametrize(
+    ("model", "changed"),
+    [
+        ("loss=0.3", "delay=1ms"),
+        ("loss=ge:0.05:0.2", "reorder=0.5"),
+        ("loss=state:0.05:0.2:0.3", "dup=0.5"),
+        ("fade=50ms:50ms:0ms:1", "rate=1Mbps,order=keep"),
+        ("handover=100ms:50ms", "loss=0.5"),
+    ],
+)
+def test_a_change_of_something_else_leaves_losses_and_interruptions_as_they_would_have_been(model, changed):
+    def stopped(copy: Copy, entry: int) -> bool:
+        return copy.fate is Fate.LOST if "handover" not in model else copy.exit_ns != entry
+
+    plain, link = impairment(model), impairment(model)
+    for n in range(2000):
+        if n == 1000:
+            link = Impairment(parse_spec(f"{model},{changed}"), np.random.default_rng(99), link)
+        expected, found = (way.step(60, n * MS)[0] for way in (plain, link))
+        hidden = "handover" in model and found.fate is Fate.LOST
+        assert hidden or stopped(found, n * MS) == stopped(expected, n * MS)
+
+
+def test_a_change_of_something_else_leaves_the_place_in_a_trace():
+    trace = Trace("", (1, 2, 3))
+    link = Impairment(LinkSpec(trace=trace), np.random.default_rng(0))
+    assert link.schedule(60, 0) == (1,)
+    link = Impairment(LinkSpec(trace=trace, delay_ns=10), np.random.default_rng(0), link)
+    assert link.schedule(60, 0) == (12,)
+    assert Impairment(LinkSpec(trace=Trace("", (5,))), np.random.default_rng(0), link).schedule(60, 0) == (5,)

@@ -340,12 +340,15 @@ def test_a_value_just_below_1_never_leads_out_of_the_four_states():
         def random(self) -> float:
             return math.nextafter(1.0, 0.0)
 
-    for p13, p14 in ((0.1, 0.9), (0.7, 0.3), (0.3, 0.7), (0.9, 0.1)):
+    # 1 - 0.06 - 0.08 + 0.06 + 0.08 is that value, not 1; so is 0.01 + 0.06 + 1 - 0.01 - 0.06
+    for p13, p14 in ((0.1, 0.9), (0.7, 0.3), (0.3, 0.7), (0.9, 0.1), (0.06, 0.08)):
         lost = FourStateLoss(p13, 1.0, 0.0, 1.0, p14).sampler(Highest())  # 1 to 4, the last that it can reach, and back
         assert [lost() for _ in range(100)] == [True, False] * 50
     for p31 in (0.1, 0.3, 0.7, 0.9):
-        lost = FourStateLoss(1.0, p31, 1.0 - p31).sampler(Highest())  # 3 is never left for itself
+        lost = FourStateLoss(1.0, p31, 1.0 - p31).sampler(Highest())  # 3 to 2, and back
         assert [lost() for _ in range(100)] == [True, False] * 50
+    lost = FourStateLoss(1.0, 0.01, 0.06).sampler(Highest())  # 3 to 3
+    assert all(lost() for _ in range(100))
 
 
 @pytest.mark.parametrize(

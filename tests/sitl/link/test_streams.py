@@ -138,6 +138,22 @@ def test_a_second_copy_draws_from_streams_of_its_own():
     assert twice - once == {"1", "3", "5", "7"}
 
 
+def test_the_second_copy_of_a_packet_is_the_same_at_any_rate_of_duplication():
+    text = "delay=9ms,jitter=gamma:5ms,reorder=0.2,corrupt=0.3"
+    links = [impairment(f"{text},dup={dup}") for dup in (0.2, 1)]
+    seldom, always = ([link.step(60, n * S) for n in range(1000)] for link in links)
+    assert 100 < sum(len(copies) == 2 for copies in seldom) < 300
+    assert all(some == both[: len(some)] for some, both in zip(seldom, always, strict=True))
+
+
+def test_a_radio_that_is_bad_more_often_loses_the_same_packets_and_more():
+    links = [impairment(f"fade={times}:0ms:0.4") for times in ("30ms:30ms", "1ms:1000s")]
+    lost, more = (np.array([link.step(60, n * MS)[0].fate is Fate.LOST for n in range(2000)]) for link in links)
+    assert lost.sum() > 200
+    assert more.sum() > 1.5 * lost.sum()
+    assert (more >= lost)[100:].all()  # the second is bad from then on
+
+
 def test_the_two_directions_draw_neither_jitter_nor_losses_in_common():
     packets = 5000
     spec = parse_spec("delay=1ms,jitter=gamma:100us,loss=0.2")
