@@ -231,8 +231,9 @@ class Scenario:
 
     def relay_node(self, *, log_rate: int = DEFAULT_LOG_RATE) -> RelayNode:
         """Return the relay, new, which records at most so many packets a second."""
-        gate = None if self.witness is None else Gate(self.witness)
-        return RelayNode(self.up, self.down, self.seed, gate, log_rate=log_rate)
+        return RelayNode(
+            self.up, self.down, self.seed, None if self.witness is None else Gate(self.witness), log_rate=log_rate
+        )
 
     def autopilot_node(self, ground_stations: int) -> AutopilotNode:
         """Return the autopilot, new."""

@@ -35,7 +35,10 @@ def _schema(
     optional: Mapping[str, dict[str, Any]] = MappingProxyType({}),
     **fields: dict[str, Any],
 ) -> Mapping[str, Any]:
-    """Return a topic's JSON Schema; every field but the optional ones is required, more fields are allowed."""
+    """Return a topic's JSON Schema; every field but the optional ones is required, more fields are allowed.
+
+    The optional ones stand under ``patternProperties``: whatever stands under ``properties`` is in each message.
+    """
     certain = {name: field for name, field in fields.items() if isinstance(field["type"], str)}
     nullable = {name: field for name, field in fields.items() if name not in certain}
     schema = {
@@ -43,10 +46,12 @@ def _schema(
         "title": title,
         "description": description,
         "type": "object",
-        "properties": certain | dict(optional),
+        "properties": certain,
         "required": list(fields),
         "additionalProperties": True,
     }
+    if optional:
+        schema["patternProperties"] = {f"^{name}$": field for name, field in optional.items()}
     if nullable:
         schema["allOf"] = [{"properties": nullable}]
     return MappingProxyType(schema)
@@ -63,10 +68,10 @@ def _link_schema(title: str, way: str) -> Mapping[str, Any]:
         size=_field("integer", "Payload, bytes."),
         fate=_field("string", "What the link did with it: delivered, lost, blackout, refused or gated."),
         copy=_field("integer", "0 for the packet itself, 1 and up for duplicates."),
-        requested_ns=_field(
-            "integer", "Delay that the link's model asked for, ns; null if it was dropped before.", nullable=True
-        ),
         optional={
+            "requested_ns": _field(
+                "integer", "Delay that the link's model asked for, ns; null if it was dropped before.", nullable=True
+            ),
             "bits": _field(
                 "array",
                 "Bits that were flipped, by number; 0 is the lowest of the first byte.",

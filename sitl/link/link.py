@@ -315,7 +315,7 @@ class Link:
     def _body(self, packet: _Packet) -> dict[str, Any]:
         """Return what is recorded of a copy."""
         delivered = packet.fate is Fate.DELIVERED
-        dropped = not delivered and packet.exit_ns == packet.entered_ns  # before a delay was asked for
+        travelled = packet.fate in (Fate.DELIVERED, Fate.GATED) or packet.exit_ns > packet.entered_ns
         body: dict[str, Any] = {
             "sent_ns": self._origin_ns + packet.entered_ns,
             "delivered_ns": self._origin_ns + self._newest_ns if delivered else None,
@@ -323,7 +323,7 @@ class Link:
             "size": len(packet.payload),
             "fate": packet.fate.value,
             "copy": packet.copy,
-            "requested_ns": None if dropped else packet.exit_ns - packet.entered_ns,
+            "requested_ns": packet.exit_ns - packet.entered_ns if travelled else None,
         }
         if packet.flipped:
             body["bits"] = list(packet.flipped)

@@ -15,7 +15,7 @@ import pytest
 
 import autopilot.__main__
 import sitl.__main__
-from autopilot.link import udp
+from autopilot.link import ports as link_ports
 from gains.command import run
 from gains.store import resolve
 from sitl.scenario import stored_scenarios
@@ -101,13 +101,13 @@ def no_socket(monkeypatch: pytest.MonkeyPatch) -> None:
 def sockets(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[socket.socket]]:
     """Give a list of the sockets that the programs open."""
     opened: list[socket.socket] = []
-    make = udp._socket
+    make = link_ports._socket
 
     def remember(family: socket.AddressFamily) -> socket.socket:
         opened.append(make(family))
         return opened[-1]
 
-    monkeypatch.setattr(udp, "_socket", remember)
+    monkeypatch.setattr(link_ports, "_socket", remember)
     yield opened
     for sock in opened:
         sock.close()

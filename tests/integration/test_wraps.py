@@ -11,6 +11,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cache
+from typing import Any
 
 import pytest
 
@@ -59,10 +60,17 @@ class Flown:
             del body["sample_ns"]
             self.commands.append(body)
         elif record.topic == "events":
-            (self.counters if body["kind"] == "counters" else self.events).append(body)
+            (self.counters if body["kind"] == "counters" else self.events).append(without_bytes(body))
 
     def count(self, node: str, what: str) -> Mapping[str, int]:
         return [c["data"][what] for c in self.counters if c["node"] == node][-1]
+
+
+def without_bytes(body: Any) -> Any:
+    """Return an event without numbers of bytes: MAVLink sends no zeros at a payload's end, so they depend on stamps."""
+    if isinstance(body, Mapping):
+        return {key: without_bytes(value) for key, value in body.items() if key != "bytes"}
+    return body
 
 
 def flight(name: str, actuator: str) -> Scenario:

@@ -44,7 +44,11 @@ def test_a_packet_meets_the_new_spec_from_the_instant_of_the_change_on_and_those
     ]
     (event,) = events(flight, "link_change")
     assert event.body["data"] == {
-        "link": "link", "direction": "up", "link_ns": 100 * MS, "spec": "delay=1ms", "at": "100ms:up:delay=1ms",
+        "link": "link",
+        "direction": "up",
+        "link_ns": 100 * MS,
+        "spec": "delay=1ms",
+        "at": "100ms:up:delay=1ms",
         "live": False,
     }
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict, replace
 from typing import Any
 
+import jsonschema
 import numpy as np
 import pytest
 from hypothesis import given
@@ -12,7 +13,7 @@ from hypothesis import strategies as st
 
 from autopilot.link.codecs import message_ids
 from autopilot.link.node import Node
-from autopilot.link.topics import SCHEMAS, is_topic
+from autopilot.link.topics import SCHEMAS, is_topic, schema_of
 from autopilot.link.wire import (
     AUTOPILOT,
     PLANT,
@@ -28,7 +29,7 @@ from sitl.link.direction import LinkConfig
 from sitl.link.gate import Gate
 from sitl.link.impairment import MAX_QUEUED
 from sitl.link.relay import Counters, RelayNode
-from sitl.link.rules import WAYS, Rule
+from sitl.link.rules import WAYS, Rule, parse_rule
 from sitl.link.spec import parse_spec
 from tests.helpers import HEARTBEAT
 from tests.sitl.relays import (
@@ -94,7 +95,7 @@ def test_records_come_in_time_order_and_fit_their_schema(up, down, entries):
     assert [r.t_ns for r in flight.records] == sorted(r.t_ns for r in flight.records)
     for record in of(flight, "up") + of(flight, "down"):
         body = record.body
-        assert body.keys() - {"bits"} == set(SCHEMAS[record.topic]["required"])
+        assert body.keys() - {"bits"} == {*SCHEMAS[record.topic]["required"], "requested_ns"}
         assert body["sent_ns"] <= record.t_ns
         assert body["delivered_ns"] == (record.t_ns if body["fate"] == "delivered" else None)
         if body["fate"] in ("lost", "refused"):
@@ -129,7 +130,11 @@ def test_with_a_gate_too_every_copy_is_accounted_for(up, down, delays, gaps):
     fates = [record.body["fate"] for record in of(flight, "down")]
     assert (fates.count("delivered"), fates.count("gated")) == (counters.delivered, counters.gated)
     assert len([port for _, port, _ in flight.left if port == "plant"]) == counters.delivered
-    assert all(record.body.keys() - {"bits"} == set(SCHEMAS["link/down"]["required"]) for record in of(flight, "down"))
+    expected = {*SCHEMAS["link/down"]["required"], "requested_ns"}
+    assert all(record.body.keys() - {"bits"} == expected for record in of(flight, "down"))
+    assert all(
+        record.body["requested_ns"] is not None for record in of(flight, "down") if record.body["fate"] == "gated"
+    )
     assert flight.relay.counters["up"].gated == 0
 
 
@@ -484,6 +489,20 @@ def test_no_more_packets_are_recorded_in_a_second_than_asked_for_and_the_others_
     ]
     assert flight.relay.counters["up"].unlogged == 220
     assert flight.relay.counters["up"].delivered == 250
+
+
+def test_a_record_with_all_that_may_be_in_it_fits_its_schema_and_one_of_a_wrong_type_does_not():
+    flight = Flight("loss=1", PERFECT, rules=[parse_rule("up:HEARTBEAT:corrupt=1")])
+    flight.send("plant", Wire(PLANT, AUTOPILOT).encode(HEARTBEAT), 0)
+    flight.send("plant", b"x", 1)
+    whole, lost = (dict(record.body) for record in of(flight, "up"))
+    assert whole.keys() >= {"bits", "rule", "requested_ns"}
+    assert lost["requested_ns"] is None
+    validator = jsonschema.Draft202012Validator(schema_of("link/one/up"))
+    assert validator.is_valid(whole)
+    assert validator.is_valid(lost)
+    for name, wrong in (("bits", [0.5]), ("rule", 3), ("requested_ns", "1")):
+        assert not validator.is_valid(whole | {name: wrong})
 
 
 def test_the_bits_that_were_flipped_are_recorded():
