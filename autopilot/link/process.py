@@ -198,7 +198,7 @@ def run_node(
             ports.append(open_port())
             stack.callback(ports[-1].socket.close)  # whatever else cannot be opened
         sink, stream = _open_sink(stack, name, ports, options, metadata)
-        for line in filter(None, (banner, _buffers_said(ports))):
+        for line in filter(None, (banner, _buffers_said(ports) if stream is None else "")):
             click.echo(line, err=True)
         sharpen_timers()
         gc.collect()
