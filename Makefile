@@ -27,7 +27,7 @@ fly: setup
 
 test: setup
 	$(BIN)/pytest -m "not long and not realtime" -n auto --dist loadfile
-	$(BIN)/pytest -m "realtime and not long" tests/integration
+	$(BIN)/pytest -m "realtime and not long"
 
 check: setup
 	$(BIN)/ruff format --check

@@ -32,6 +32,8 @@ from sitl.plot import flight_figure
 from sitl.scenario import load_scenario
 from tests.integration.programs import alive, children_of, eventually, program
 
+pytestmark = pytest.mark.realtime
+
 RESUMED_S = 2.0
 LOST_S = 1.0
 PROMPT_START_S = 1.0
