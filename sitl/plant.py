@@ -160,6 +160,8 @@ class PlantNode:
     def __init__(self, config: PlantConfig, seal: Seal | None = None) -> None:
         self.config = config
         self.model = config.model
+        self._Ts_ns = config.model.Ts_ns
+        self._still = np.zeros(config.model.nw)
         self.travel = travel_of(config.model)
         self.aircraft = LinearAircraft(config.model)
         self.wire = Wire(PLANT, AUTOPILOT, seal=seal)
@@ -214,7 +216,7 @@ class PlantNode:
         if flight is None:
             return
         for _ in range(MAX_CATCH_UP):
-            t_ns = flight.t0_ns + flight.k * self.model.Ts_ns
+            t_ns = flight.t0_ns + flight.k * self._Ts_ns
             if t_ns > now_ns:
                 break
             self._sample(flight, t_ns, now_ns)
@@ -223,7 +225,7 @@ class PlantNode:
         """Return when the next sample or heartbeat is due; None before the autopilot has spoken."""
         if self._flight is None or self._next_heartbeat_ns is None:
             return self._next_heartbeat_ns
-        return min(self._next_heartbeat_ns, self._flight.t0_ns + self._flight.k * self.model.Ts_ns)
+        return min(self._next_heartbeat_ns, self._flight.t0_ns + self._flight.k * self._Ts_ns)
 
     def outgoing(self) -> list[Datagram]:
         """Take away the datagrams to send."""
@@ -239,7 +241,7 @@ class PlantNode:
 
     def _start(self, now_ns: int) -> None:
         """Begin the clockwork at the next instant of the grid."""
-        Ts_ns = self.model.Ts_ns
+        Ts_ns = self._Ts_ns
         x0 = self.model.trim.x if self.config.x0 is None else self.config.x0
         condition = self.model.condition
         self._flight = _Flight(
@@ -263,7 +265,7 @@ class PlantNode:
             return
         if wraps:
             stamp_us = unwrap(stamp_us, now_ns // NS_PER_US, 1 << 32)
-        j = round((stamp_us * NS_PER_US - flight.t0_ns) / self.model.Ts_ns)
+        j = round((stamp_us * NS_PER_US - flight.t0_ns) / self._Ts_ns)
         if not 0 <= j < flight.k:
             self.refusals[Refusal.STAMP] += 1
         elif len(flight.pending) >= MAX_COMMANDS:
@@ -296,7 +298,7 @@ class PlantNode:
         latch, k = flight.latch, flight.k
         target = self.travel.neutral if latch.timed_out else latch.u
         flight.position = self._elevator.move(k, flight.position, np.array([target]))
-        w = self._gust.w(k) if self._gust is not None else np.zeros(self.model.nw)
+        w = self._gust.w(k) if self._gust is not None else self._still
         delta = self.config.delta.delta(k) if self.config.delta is not None else 0.0
         d = None if latch.j is None else k - latch.j
         body = {
@@ -334,11 +336,13 @@ class PlantNode:
             self._send(NamedValueInt(ms, "SAMPLE_K", flight.k))
         if d is not None:
             self._send(NamedValueInt(ms, "DELAY_K", d))
-        attitude, air = self._fields(self._faulty_sensors.sense(flight.k, flight.x))
+        sensed = self._faulty_sensors.sense(flight.k, flight.x)
+        attitude, air = self._fields(sensed)
         self._send(Attitude(time_boot_ms=ms, **attitude))
         if air is not None and self.config.aoa:
             self._send(AoaSsa(t_ns // NS_PER_US, air.get("AOA", 0.0), air.get("SSA", 0.0)))
-        attitude, air = self._fields(flight.x)  # the air data system is another sensor, without faults
+        if sensed is not flight.x:
+            attitude, air = self._fields(flight.x)  # the air data system is another sensor, without faults
         condition = self.model.condition
         speed = condition.airspeed_m_s if condition is not None else 0.0
         climb = speed * math.sin(attitude["pitch"] - math.radians(air.get("AOA", 0.0) if air else 0.0))

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 from autopilot.link.clock import Clock
-from autopilot.link.node import Node, Record
+from autopilot.link.node import Datagram, Node, Record
 
 __all__ = ["MAX_WAITING", "Loss", "Participant", "VirtualNetwork"]
 
@@ -193,11 +193,13 @@ class VirtualNetwork:
             if not waiting or self._states[i].frozen:
                 i += 1
                 continue
-            port, datagram = waiting.popleft()
             p = self._participants[i]
-            if self._tapped[i]:
-                self._tap(p.name, port, "received", datagram, self.now_ns)  # type: ignore[misc]
-            p.node.receive(port, datagram, p.clock.node_ns(self.now_ns))
+            receive, now_ns = p.node.receive, p.clock.node_ns(self.now_ns)
+            while waiting:
+                port, datagram = waiting.popleft()
+                if self._tapped[i]:
+                    self._tap(p.name, port, "received", datagram, self.now_ns)  # type: ignore[misc]
+                receive(port, datagram, now_ns)
             if self._collect(i):
                 i = 0
 
@@ -225,7 +227,7 @@ class VirtualNetwork:
         """Ask a node for its deadline, and map it to true time when it is a new one, or the node or its clock is."""
         p, state = self._participants[i], self._states[i]
         deadline_ns = None if state.dead or state.frozen else p.node.next_deadline_ns()
-        if anew or deadline_ns != self._deadlines[i]:
+        if deadline_ns != self._deadlines[i] or anew:
             self._deadlines[i] = deadline_ns
             self._due[i] = None if deadline_ns is None else p.clock.true_ns(deadline_ns)
 
@@ -233,18 +235,23 @@ class VirtualNetwork:
         """Take what a node has sent and recorded, and its new deadline; return whether it sent anything."""
         p = self._participants[i]
         outgoing = p.node.outgoing()
-        for port, datagram in outgoing:
-            if self._states[i].mute:
-                self.losses[p.name][Loss.MUTE] += 1
-                continue
-            if self._tapped[i]:
-                self._tap(p.name, port, "sent", datagram, self.now_ns)  # type: ignore[misc]
-            far = self._wires.get((i, port))
-            if far is not None:
-                self._deliver_to(far[0], far[1], datagram)
+        if outgoing:
+            self._send(i, p, outgoing)
         records = p.node.records()
         if self._sink is not None:
             for record in records:
                 self._sink(record, p.clock.true_ns(record.t_ns))
         self._schedule(i)
         return bool(outgoing)
+
+    def _send(self, i: int, p: Participant, outgoing: Sequence[Datagram]) -> None:
+        """Put what a node has sent before those at the other ends."""
+        if self._states[i].mute:
+            self.losses[p.name][Loss.MUTE] += len(outgoing)
+            return
+        for port, datagram in outgoing:
+            if self._tapped[i]:
+                self._tap(p.name, port, "sent", datagram, self.now_ns)  # type: ignore[misc]
+            far = self._wires.get((i, port))
+            if far is not None:
+                self._deliver_to(far[0], far[1], datagram)

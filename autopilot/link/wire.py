@@ -85,6 +85,8 @@ MAX_FRAMES = 64
 """Frames of one datagram that are looked at: what one datagram costs is bounded."""
 
 _SIGNED = dialect.MAVLINK_IFLAG_SIGNED
+_V1, _V1_HEADER_BYTES = dialect.PROTOCOL_MARKER_V1, dialect.HEADER_LEN_V1
+_V2, _V2_HEADER_BYTES = dialect.PROTOCOL_MARKER_V2, dialect.HEADER_LEN_V2
 
 ACCEPTED = "accepted"
 """What a seal says of a frame that it accepts."""
@@ -130,9 +132,10 @@ class Seal(Protocol):
         """Take the own time."""
 
 
-_HEADER = struct.Struct("<BBBBBB3s")
-"""What follows the marker: length, two flags, number, system, component, message id."""
-_MARKER = bytes((dialect.PROTOCOL_MARKER_V2,))
+_HEADER = struct.Struct("<BBBB2s3s")
+"""What follows the marker: length, two flags, number, system and component, message id."""
+_CRC = struct.Struct("<H")
+_MARKER = bytes((_V2,))
 
 
 class Wire:
@@ -158,6 +161,7 @@ class Wire:
         seal: Seal | None = None,
     ) -> None:
         self.source = source
+        self._source_bytes = bytes(source)
         self.peer = peer
         self.seal = seal
         self._by_id = {codec.id: codec for message, codec in CODECS.items() if message in accepts}
@@ -172,11 +176,10 @@ class Wire:
         payload = codec.payload.pack(*codec.values(message))
         payload = payload.rstrip(b"\0") or payload[:1]
         flags = 0 if self.seal is None else _SIGNED
-        body = _HEADER.pack(len(payload), flags, 0, self._sequence, *self.source, codec.id_bytes) + payload
+        body = _HEADER.pack(len(payload), flags, 0, self._sequence, self._source_bytes, codec.id_bytes) + payload
         self._sequence = (self._sequence + 1) % 256
         self.sent += 1
-        crc: int = mcrf4xx(body + codec.crc_extra)
-        frame = _MARKER + body + crc.to_bytes(2, "little")
+        frame = _MARKER + body + _CRC.pack(mcrf4xx(body + codec.crc_extra))
         return frame if self.seal is None else self.seal.sign(frame)
 
     def decode(self, datagram: bytes) -> list[Message]:
@@ -206,12 +209,12 @@ class Wire:
 
     def _parse(self, frame: bytes) -> tuple[Source, Message] | Reject:
         """Return who sent a frame and its message, or why it is not accepted."""
-        if frame[0] == dialect.PROTOCOL_MARKER_V2:
-            source, number = (frame[5], frame[6]), int.from_bytes(frame[7:10], "little")
-            start = dialect.HEADER_LEN_V2
+        if frame[0] == _V2:
+            source, number = (frame[5], frame[6]), frame[7] | frame[8] << 8 | frame[9] << 16
+            start = _V2_HEADER_BYTES
         else:
             source, number = (frame[3], frame[4]), frame[5]
-            start = dialect.HEADER_LEN_V1
+            start = _V1_HEADER_BYTES
         codec = self._by_id.get(number)
         if codec is None and number not in dialect.mavlink_map:
             return Reject.UNKNOWN_ID
@@ -238,19 +241,19 @@ def split_frames(datagram: bytes) -> tuple[list[bytes], Reject | None]:
     start, end = 0, len(datagram)
     while start < end:
         marker = datagram[start]
-        if marker == dialect.PROTOCOL_MARKER_V2:
-            if end - start < dialect.HEADER_LEN_V2 + 2:
+        if marker == _V2:
+            if end - start < _V2_HEADER_BYTES + _CRC.size:
                 return frames, Reject.TRUNCATED
             flags = datagram[start + 2]
             if flags & ~_SIGNED:
                 return frames, Reject.MALFORMED
-            length = dialect.HEADER_LEN_V2 + datagram[start + 1] + 2
+            length = _V2_HEADER_BYTES + datagram[start + 1] + _CRC.size
             if flags & _SIGNED:
                 length += dialect.MAVLINK_SIGNATURE_BLOCK_LEN
-        elif marker == dialect.PROTOCOL_MARKER_V1:
-            if end - start < dialect.HEADER_LEN_V1 + 2:
+        elif marker == _V1:
+            if end - start < _V1_HEADER_BYTES + _CRC.size:
                 return frames, Reject.TRUNCATED
-            length = dialect.HEADER_LEN_V1 + datagram[start + 1] + 2
+            length = _V1_HEADER_BYTES + datagram[start + 1] + _CRC.size
         else:
             return frames, Reject.NO_FRAME
         if end - start < length:

@@ -103,6 +103,8 @@ class FaultyElevator:
         position, command : (nu,) array
             Where it was over the last period, and where it shall go; absolute.
         """
+        if not self._faults:
+            return move_actuator(self._model, position, command)
         acting = [fault for fault in self._faults if _acts(fault, k * self._model.Ts_ns)]
         kinds = [fault.kind for fault in acting]
         if ElevatorFaultKind.STUCK in kinds:

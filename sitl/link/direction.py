@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sitl.link.changes import MAX_CHANGES, Change
-from sitl.link.impairment import Impairment, LinkSpec
+from sitl.link.impairment import Fate, Impairment, LinkSpec
 from sitl.link.precision import Histogram
 from sitl.link.rules import MAX_RULES, WAYS, Rule, Way, rule_finder
 
@@ -96,6 +96,19 @@ class Counters:
     reordered: int = 0
     bytes: int = 0
     unlogged: int = 0
+
+    def count(self, fate: Fate, size: int, late: bool) -> None:
+        """Count a copy of this many bytes by its fate; ``late`` if it left after one that had entered later."""
+        if fate is Fate.DELIVERED:
+            self.delivered += 1
+            self.bytes += size
+            self.reordered += late
+        elif fate is Fate.REFUSED:
+            self.refused += 1
+        elif fate is Fate.GATED:
+            self.gated += 1
+        else:
+            self.lost += 1
 
 
 Delivery = tuple[int, int, int, int]

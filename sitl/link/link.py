@@ -28,7 +28,7 @@ from autopilot.link.clock import NS_PER_S
 from autopilot.link.node import Datagram, Record
 from gains.table import InputError
 from sitl.link.changes import MAX_CHANGES, Change, format_change
-from sitl.link.direction import Counters, Direction, Lane, LinkConfig
+from sitl.link.direction import Direction, Lane, LinkConfig
 from sitl.link.gate import Gate, GateStep
 from sitl.link.impairment import Copy, Fate, LinkSpec
 from sitl.link.rules import Way
@@ -261,7 +261,10 @@ class Link:
             packet = heappop(heap)
             packet.direction.queued -= 1
             packet.lane.queued -= 1
-            self._settle(packet)
+            if self.gate is None:
+                self._conclude(packet)
+            else:
+                self._settle(packet)
 
     def _settle(self, packet: _Packet) -> None:
         """Let a copy meet its fate now; a command that would leave goes to the gate instead."""
@@ -293,11 +296,11 @@ class Link:
 
         ``timed`` says that the gate chose the time, so it tells nothing about precision.
         """
-        direction, now_ns = packet.direction, self._newest_ns
+        direction, lane, now_ns = packet.direction, packet.lane, self._newest_ns
         late = packet.number < direction.newest
-        _count(direction.counters, packet, late)
-        if packet.lane.counters is not None:
-            _count(packet.lane.counters, packet, late)
+        direction.counters.count(packet.fate, len(packet.payload), late)
+        if lane.counters is not None:
+            lane.counters.count(packet.fate, len(packet.payload), late)
         if packet.fate is Fate.DELIVERED:
             if not late:
                 direction.newest = packet.number
@@ -338,21 +341,6 @@ def flip(datagram: bytes, bits: tuple[int, ...]) -> bytes:
     for bit in bits:
         flipped[bit >> 3] ^= 1 << (bit & 7)
     return bytes(flipped)
-
-
-def _count(counters: Counters, packet: _Packet, late: bool) -> None:
-    """Count a copy by its fate."""
-    fate = packet.fate
-    if fate is Fate.DELIVERED:
-        counters.delivered += 1
-        counters.bytes += len(packet.payload)
-        counters.reordered += late
-    elif fate is Fate.REFUSED:
-        counters.refused += 1
-    elif fate is Fate.GATED:
-        counters.gated += 1
-    else:
-        counters.lost += 1
 
 
 def _count_further(direction: Direction, lane: Lane) -> None:

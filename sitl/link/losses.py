@@ -59,7 +59,7 @@ def _named(name: str) -> Callable[[_Model], _Model]:
 def memoryless(probability: float, rng: np.random.Generator) -> Callable[[], bool]:
     """Return a source of independent losses. It owns ``rng``."""
     random = rng.random
-    return lambda: random() < probability
+    return (lambda: random() < probability) if probability > 0.0 else (lambda: False)
 
 
 @_named("corr")

@@ -37,6 +37,8 @@ MAX_LINKS = 16
 DEFAULT_LOG_RATE = 5000
 """The most records of packets in one second, so that a flood does not fill the disk."""
 
+_LONG_AGO_NS = -(1 << 62)
+
 
 class RelayNode:
     """Links between autopilots and plants.
@@ -100,7 +102,7 @@ class RelayNode:
             self._entries[f"{prefix}autopilot"] = (link, link.down)
         self._control = {"requests": 0, "refused": 0, "malformed": 0}
         self._told: Mapping[str, Any] = {}
-        self._told_ns: int | None = None
+        self._told_ns = _LONG_AGO_NS
 
     @property
     def counters(self) -> dict[str, Counters]:
@@ -126,13 +128,15 @@ class RelayNode:
         else:
             link, direction = entry
             link.receive(direction, datagram, now_ns)
-        self._tell_each_second(now_ns)
+        if not -NS_PER_S < now_ns - self._told_ns < NS_PER_S:
+            self._tell_each_second(now_ns)
 
     def tick(self, now_ns: int) -> None:
         """Let out what is due."""
         for link in self._links:
             link.tick(now_ns)
-        self._tell_each_second(now_ns)
+        if not -NS_PER_S < now_ns - self._told_ns < NS_PER_S:
+            self._tell_each_second(now_ns)
 
     def next_deadline_ns(self) -> int | None:
         """Return when the next packet leaves, or None."""
@@ -161,11 +165,10 @@ class RelayNode:
     # Counters
 
     def _tell_each_second(self, now_ns: int) -> None:
-        """Record the counters when a second has passed since they were recorded."""
-        told_ns = self._told_ns
-        if told_ns is None:
+        """Record the counters, as a second has passed since they were recorded; the first second begins now."""
+        if self._told_ns == _LONG_AGO_NS:
             self._told_ns = now_ns
-        elif not -NS_PER_S < now_ns - told_ns < NS_PER_S:
+        else:
             self._tell(now_ns)
 
     def _tell(self, now_ns: int) -> None:

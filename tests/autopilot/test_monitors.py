@@ -308,7 +308,7 @@ def test_wrong_samples_do_not_keep_an_aircraft_at_rest_in_neutral_for_ever(wrong
         """Let the first ATTITUDE after the gap be wrong in q."""
         messages = reader.decode(datagram) if port == "plant" and len(spoilt) < wrong else []
         if messages and isinstance(messages[0], Attitude):
-            datagram = writer.encode(replace(messages[0], pitchspeed=1.5))
+            datagram = writer.encode(messages[0]._replace(pitchspeed=1.5))
             spoilt.append(now_ns)
         receive(port, datagram, now_ns)
 

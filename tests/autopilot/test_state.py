@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -99,7 +97,7 @@ def test_halves_belong_together_below_half_a_period_and_not_at_it():
     for apart_ms, together in ((12, True), (13, False)):
         assembler = numbered()
         attitude, air = halves(0, late_us=0)
-        samples = feed(assembler, [attitude, replace(air, time_usec=air.time_usec + apart_ms * 1000)])
+        samples = feed(assembler, [attitude, air._replace(time_usec=air.time_usec + apart_ms * 1000)])
         assert bool(samples) is together
 
 
@@ -332,7 +330,7 @@ def test_an_angle_of_attack_stamped_by_a_u32_counter_wraps_after_71_minutes(up_f
     samples = []
     for k in range(40):
         attitude, air = halves(k, up_for_ns)
-        for message in (attitude, replace(air, time_usec=air.time_usec % (1 << 32))):
+        for message in (attitude, air._replace(time_usec=air.time_usec % (1 << 32))):
             samples.append(assembler.add(message, 0, near_ns and near_ns + (k + 1) * TS))
     stamps = [s.t_ns for s in samples if s is not None]
     assert [s.j for s in samples if s is not None] == list(range(40))
@@ -345,7 +343,7 @@ def test_such_a_vehicle_is_found_again_after_a_blackout_across_the_wrap():
     t0_ns = U32_US - 10 * TS
     assembler = numbered(0, t0_ns)
     stream = [m for k in (*range(5), *range(900, 910)) for m in halves(k, t0_ns)]
-    stream = [replace(m, time_usec=m.time_usec % (1 << 32)) if isinstance(m, AoaSsa) else m for m in stream]
+    stream = [m._replace(time_usec=m.time_usec % (1 << 32)) if isinstance(m, AoaSsa) else m for m in stream]
     assert [s.j for s in feed(assembler, stream)] == [*range(5), *range(900, 910)]
 
 

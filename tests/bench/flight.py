@@ -64,7 +64,8 @@ def shown_every_sample(scenario: Scenario, write: Write | None) -> tuple[Virtual
 
 def fly(scenario: Scenario, write: Write | None) -> None:
     network, plant = shown_every_sample(scenario, write)
-    network.run(lambda: plant.samples >= scenario.samples, 10**12)
+    samples = scenario.samples
+    network.run(lambda: plant.samples >= samples, 10**12)
 
 
 def pymavlink_alone(sent: list[bytes], received: list[bytes]) -> float:

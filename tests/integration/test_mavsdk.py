@@ -33,7 +33,7 @@ PATIENCE_S = 20.0
 PARAMETER, VALUE, OUT_OF_RANGE = "STICK_DEG", 7.5, -1.0
 RATE_HZ = 10.0
 INTERVALS = 20
-"""So many that a machine which is busy for a tenth of a second at the wrong moment does not change the rate by a tenth."""
+"""So many that a machine which is busy for a moment does not change their mean by a tenth."""
 GUIDED, STABILIZE = 15, 2
 OFFBOARD_DEG = 2.0
 
