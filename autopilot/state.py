@@ -21,8 +21,9 @@ does, or their numbers have fallen back, the track is lost: ``lost`` says why, a
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import StrEnum
+from typing import NamedTuple
 
 from autopilot.alpha import AlphaChoice, AlphaSource, alpha_selector
 from autopilot.link.clock import NS_PER_MS, NS_PER_S, NS_PER_US, unwrap
@@ -81,8 +82,7 @@ class Drop(StrEnum):
     """No VFR_HUD to take the angle of attack from: none has come of late, or it is too slow."""
 
 
-@dataclass(frozen=True, slots=True)
-class Sample:
+class Sample(NamedTuple):
     """One complete measurement of the state.
 
     Attributes
@@ -376,7 +376,7 @@ class SampleAssembler:
         if self._first is not None:
             self._first = (self._first[0], _nearest(self._first[1], near_ns, TURN_NS))
         if self._waiting is not None:
-            self._waiting = replace(self._waiting, t_ns=_nearest(self._waiting.t_ns, near_ns, TURN_NS))
+            self._waiting = self._waiting._replace(t_ns=_nearest(self._waiting.t_ns, near_ns, TURN_NS))
 
     # Samples
 

@@ -11,8 +11,7 @@ Order within one instant, kept by both drivers: deliveries before ticks, then no
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 __all__ = ["Datagram", "Node", "Record"]
 
@@ -20,8 +19,7 @@ Datagram = tuple[str, bytes]
 """(port name, payload). A port is a name; the driver maps it to a socket and its one peer."""
 
 
-@dataclass(frozen=True, slots=True)
-class Record:
+class Record(NamedTuple):
     """One message of a recording.
 
     Attributes
