@@ -101,6 +101,6 @@ def obey(order: Order, driver: UdpDriver) -> None:
         case BreakSends(for_ns):
             driver.break_sends(for_ns)
         case MovePeer(number):
-            for port in driver._ports:
+            for port in driver.ports:
                 if port.name == _LISTENING and port.peer is not None:
                     port.peer = (port.peer[0], number)

@@ -87,6 +87,12 @@ class UdpDriver:
     spin_ns : int
         How long before the node's deadline to stop sleeping and look at the ports again and again: from 0 to
         ``MAX_SPIN_NS``.
+
+    Attributes
+    ----------
+    node, clock, on_pass
+        As given; the clock as it runs now.
+    ports : list of UdpPort
     """
 
     def __init__(
@@ -104,8 +110,8 @@ class UdpDriver:
         assert 0 <= spin_ns <= MAX_SPIN_NS, spin_ns
         self.node = node
         self.clock = Clock(clock.offset_ns, clock.drift_ppb, true_ns())
-        self._ports = list(ports)
-        self._control, self._others = self._ports[:control], self._ports[control:]
+        self.ports = list(ports)
+        self._control, self._others = self.ports[:control], self.ports[control:]
         self._last = -1
         self.on_pass = on_pass
         self._spin_ns = spin_ns
@@ -118,7 +124,7 @@ class UdpDriver:
 
     def run(self, stopping: Callable[[], bool]) -> None:
         """Serve the node until ``stopping()`` holds."""
-        self._by_number = {port.socket.fileno(): port for port in self._ports}
+        self._by_number = {port.socket.fileno(): port for port in self.ports}
         while not stopping():
             self.serve(self._wait())
 
@@ -147,7 +153,7 @@ class UdpDriver:
 
     def close(self) -> None:
         """Close the sockets."""
-        for port in self._ports:
+        for port in self.ports:
             port.socket.close()
 
     def step_clock(self, by_ns: int) -> None:
@@ -162,7 +168,7 @@ class UdpDriver:
 
     def break_sends(self, for_ns: int) -> None:
         """Send nothing for so long; what should have been sent is counted as unsent."""
-        for port in self._ports:
+        for port in self.ports:
             port.broken_until_ns = true_ns() + for_ns
 
     def _wait(self) -> Collection[UdpPort]:

@@ -119,7 +119,7 @@ def test_a_drifting_clock_does_not_jump(driver: UdpDriver) -> None:
 
 
 def test_broken_sends_are_counted_and_those_of_a_mended_one_arrive(driver: UdpDriver) -> None:
-    [port] = driver._ports
+    [port] = driver.ports
     with closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as far:
         far.bind(HOME)
         far.settimeout(5.0)
@@ -135,7 +135,7 @@ def test_broken_sends_are_counted_and_those_of_a_mended_one_arrive(driver: UdpDr
 
 
 def test_a_moved_peer_is_heard_at_once_and_the_old_one_no_longer(driver: UdpDriver) -> None:
-    [port] = driver._ports
+    [port] = driver.ports
     with (
         closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as old,
         closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as new,

@@ -33,7 +33,7 @@ def serving(node: RelayNode) -> Iterator[str]:
     """Serve the control port of a relay; give its address."""
     with closing(UdpDriver(node, [answer("control", ("127.0.0.1", 0))], Clock())) as driver:
         stopped = threading.Event()
-        host, port = driver._ports[0].local
+        host, port = driver.ports[0].local
         thread = threading.Thread(target=driver.run, args=(stopped.is_set,))
         thread.start()
         try:
