@@ -243,6 +243,8 @@ class Impairment:
         self._apart = spec.gap - 1
         self._number = 0
         """Of the packet, for a trace without times."""
+        self._instant_ns, self._together = -1, 0
+        """When the latest packet entered, and how many did at that instant, for a trace with times."""
         self._since_overtaking = 0
         """Copies since one overtook, at most ``_apart``."""
         self._busy = 0
@@ -265,6 +267,7 @@ class Impairment:
             self._lost = before._lost
         if spec.trace == last.trace:
             self._number = before._number
+            self._instant_ns, self._together = before._instant_ns, before._together
         if spec.fading == last.fading:
             self._bad_at, self._fading_lost = before._bad_at, before._fading_lost
         if spec.handover == last.handover:
@@ -320,8 +323,11 @@ class Impairment:
         """Return what trace and radio add to the delay of a packet that enters now; None if they lose it."""
         extra_ns: int | None = 0
         if self.spec.trace is not None:
-            extra_ns = self.spec.trace.delay_ns(self._number, now_ns)
+            if now_ns != self._instant_ns:
+                self._instant_ns, self._together = now_ns, 0
+            extra_ns = self.spec.trace.delay_ns(self._number, now_ns, self._together)
             self._number += 1
+            self._together += 1
         if self._bad_at is not None and self._fading_lost is not None and self.spec.fading is not None:
             lost = self._fading_lost()
             if self._bad_at(now_ns):

@@ -166,12 +166,12 @@ def _by_time(
 ) -> Trace:
     """Return the trace of entries with times, which do not fall, that stand for the time from begin to end.
 
-    It goes on for one mean distance of its entries beyond the end. The first entry also holds for what was before it.
+    It goes on for one mean distance of its entries beyond the end.
     """
     begin_ns, end_ns = (times_ns[0], times_ns[-1]) if span_ns is None else span_ns
     distances = len(times_ns) - 1
     gap_ns = max(1, round((times_ns[-1] - times_ns[0]) / distances)) if distances else NS_PER_S
-    since_ns = (0, *(time_ns - begin_ns for time_ns in times_ns[1:]))
+    since_ns = tuple(time_ns - begin_ns for time_ns in times_ns)
     return Trace(source, tuple(delays_ns), since_ns, end_ns - begin_ns + gap_ns)
 
 

@@ -67,6 +67,14 @@ def test_delays_with_times_are_met_by_time(write):
     ]
 
 
+def test_packets_of_one_instant_take_the_entries_of_that_instant_in_turn(write):
+    path = write("t_s,delay_ms\n0,10\n1,20\n1,\n1,40\n2,50\n")
+    link = impairment(f"trace={path}")
+    times_ns = [0, 0, S, S, S, S, S + 1, 2 * S]
+    delays_ms = [(exit_ns[0] - at_ns) // MS if (exit_ns := link.schedule(10, at_ns)) else None for at_ns in times_ns]
+    assert delays_ms == [10, 10, 20, None, 40, 40, 40, 50]
+
+
 def test_a_table_of_both_directions_is_chosen_from_with_up_and_down(write):
     path = write("up_ms,down_ms\r\n1,2\r\nlost,4\r\n")
     assert load_trace(f"{path}#up").delays_ns == (MS, None)
@@ -340,7 +348,8 @@ def test_a_recording_gives_both_directions_on_their_common_time(tmp_path):
         ],
     )
     up, down = load_trace(f"{path}#up"), load_trace(f"{path}#down")
-    assert up == Trace(f"{path}#up", (5 * MS, None, 9 * MS), (0, 200 * MS, 300 * MS), 400 * MS)
+    assert up == Trace(f"{path}#up", (5 * MS, None, 9 * MS), (100 * MS, 200 * MS, 300 * MS), 400 * MS)
+    assert [up.delay_ns(0, at_ns) for at_ns in (0, 100 * MS, 199 * MS)] == [5 * MS] * 3
     assert down.delays_ns == (7 * MS,)
     assert down.times_ns == (0,)
 
