@@ -236,6 +236,7 @@ class Pilot:
         self._fresh_ns, self._last, self._clock_known = now_ns, sample, clock_known
         if self._first_j is None:
             self._first_j = sample.j
+            self._idle = sample.j > self.window[1]  # the flight had begun before, with another hand or with nobody
         engaged = self._engage(*self._worth(sample, forecast, now_ns), now_ns)
         chosen = self.chooser.choose(forecast.d, forecast.low, forecast.high)
         law, gains, gain_set = self._in_force(chosen)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from itertools import pairwise
 
@@ -9,6 +10,7 @@ import pytest
 
 from autopilot.link.clock import Clock
 from autopilot.link.node import Record
+from sitl.faults import parse_fault
 from sitl.flight import fly_virtual, virtual_network
 from sitl.scenario import load_scenario
 
@@ -83,3 +85,16 @@ def test_the_law_takes_over_without_a_jump_of_the_elevator(variant: str | None) 
             break
     else:
         pytest.fail("no re-entry")
+
+
+def test_the_law_of_a_restarted_autopilot_takes_over_without_a_jump_of_the_elevator() -> None:
+    """The aircraft has climbed to the reference by then; the new autopilot's own reference model begins at rest."""
+    scenario = load_scenario("nominal").with_faults([parse_fault("kill:autopilot@5s+0.5s")])
+    commands: list[dict] = []
+    fly_virtual(scenario, lambda r, _: commands.append(dict(r.body)) if r.topic == "autopilot/command" else None)
+    [first] = [i for i, (before, after) in enumerate(pairwise(commands), 1) if after["j"] - before["j"] > 10]
+    flown = commands[first:]
+    assert {command["mode"] for command in flown} == {"TRACKING"}
+    assert flown[0]["r"] == [pytest.approx(math.radians(5.0))]
+    assert abs(flown[0]["u"][0]) < 1e-3, "the plant's time-out has put the elevator to neutral"
+    assert max(abs(command["u"][0]) for command in flown) < math.radians(2.0)
