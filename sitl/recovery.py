@@ -2,7 +2,8 @@
 
 It has the elevator at a sample when the plant holds a command that a law made since the fault was over; the plant's
 servo time-out is no law. It has it *again* when it keeps it for a second, or up to the next fault or the end: a clock
-that steps is noticed some samples later, and what the law does until then is not yet recovery.
+that steps is noticed some samples later, and what the law does until then is not yet recovery. A next fault that leaves
+no sample in between counts as the same.
 """
 
 from __future__ import annotations
@@ -73,17 +74,19 @@ class _Flown:
         """Return since when a law has the elevator again after a fault."""
         before = self.mode_before(period.begin_ns)
         laws = {Mode.TRACKING.value} | ({before} & {mode.value for mode in FLOWN_BY_LAW})
-        following = bisect_left(self.begins_ns, end_ns + 1)
-        limit_ns = self.begins_ns[following] if following < len(self.begins_ns) else None
+        limits = iter(self.begins_ns[bisect_left(self.begins_ns, end_ns + 1) :])
+        limit_ns = next(limits, None)
         made: dict[int, str] = {}
         since_ns: int | None = None
         last_k = -1
         for topic, at_ns, body in self.steps[bisect_left(self.steps, end_ns, key=itemgetter(1)) :]:
-            if limit_ns is not None and at_ns >= limit_ns:
-                break
             if topic == "autopilot/command":
                 made[body["j"]] = body["mode"]
                 continue
+            while limit_ns is not None and at_ns >= limit_ns and last_k < 0:
+                limit_ns = next(limits, None)
+            if limit_ns is not None and at_ns >= limit_ns:
+                break
             if body["k"] <= last_k:
                 made.clear()  # the plant has started again
             last_k = body["k"]

@@ -94,6 +94,13 @@ def test_up_to_the_next_fault_is_long_enough() -> None:
     assert second.recovered_s == pytest.approx(72 * 0.025)
 
 
+def test_faults_with_no_sample_between_them_are_recovered_from_together() -> None:
+    texts = ("drift:plant:200ppm@1.001s", "drift:autopilot:-200ppm@1.002s", "disk-full@1.003s")
+    assert [fault.recovered_s for fault in told(flown(LAW * 200), *texts)] == [pytest.approx(43 * 0.025)] * 3
+    both = told(flown(LAW * 50 + HOLD * 20 + LAW * 130), "step:plant:1s@1.2501s", "step:autopilot:1s@1.2502s")
+    assert [fault.recovered_s for fault in both] == [pytest.approx(72 * 0.025)] * 2
+
+
 @pytest.mark.parametrize("modes", [LAW * 40 + HOLD * 160, LAW * 199 + HOLD, LAW * 40 + ["NEUTRAL"] * 160])
 def test_a_law_that_never_comes_back_has_never_recovered_and_a_check_on_that_fails(modes: list[str]) -> None:
     flight = flown(modes) if modes[-2] != "TRACKING" else flown(modes[:45] + HOLD * 155)
