@@ -17,6 +17,8 @@ from sitl.scenario import Scenario, load_scenario, stored_scenarios
 STORED = [name for name in stored_scenarios() if name.startswith("fault-")]
 S = 1_000_000_000
 NOMINAL = load_scenario("nominal")
+PROMPT_S = {"fault-kill-relay": 0.3, "fault-kill-plant": 0.9, "fault-kill-autopilot": 1.05, "fault-corrupt-gains": 1.05}
+"""What recovery takes where a program starts at once, as it does in virtual time; the scenarios leave it time to."""
 
 
 def outcome_of(scenario: Scenario) -> Outcome:
@@ -27,6 +29,12 @@ def seeded(name: str, seed: int) -> Scenario:
     scenario = load_scenario(name)
     variants = {variant: replace(changed, seed=seed) for variant, changed in scenario.variants.items()}
     return replace(scenario, seed=seed, variants=variants)
+
+
+def hold_what_they_promise(name: str, outcome: Outcome) -> None:
+    assert outcome.passed, [verdict for verdict in outcome.verdicts if not verdict.passed]
+    if name in PROMPT_S:
+        assert outcome.summary["recovery_s"] <= PROMPT_S[name]
 
 
 def with_faults(*texts: str, duration_s: float = 5.0, **changed: Any) -> Scenario:
@@ -52,16 +60,14 @@ def test_there_is_a_scenario_for_every_kind_of_fault() -> None:
 
 @pytest.mark.parametrize("name", STORED)
 def test_every_fault_scenario_passes_its_checks(name: str) -> None:
-    outcome = outcome_of(load_scenario(name))
-    assert outcome.passed, [verdict for verdict in outcome.verdicts if not verdict.passed]
+    hold_what_they_promise(name, outcome_of(load_scenario(name)))
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("seed", range(1, 21))
 @pytest.mark.parametrize("name", STORED)
 def test_every_fault_scenario_passes_its_checks_whatever_the_seed(name: str, seed: int) -> None:
-    outcome = outcome_of(seeded(name, seed))
-    assert outcome.passed, [verdict for verdict in outcome.verdicts if not verdict.passed]
+    hold_what_they_promise(name, outcome_of(seeded(name, seed)))
 
 
 @pytest.mark.parametrize(

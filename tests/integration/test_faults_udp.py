@@ -29,7 +29,7 @@ from sitl.faults import PROGRAMS, parse_fault
 from sitl.flightdata import FlightData
 from sitl.fly import FlightOptions, fly
 from sitl.plot import flight_figure
-from sitl.scenario import load_scenario
+from sitl.scenario import load_scenario, stored_scenarios
 from tests.integration.programs import alive, children_of, eventually, program
 
 pytestmark = pytest.mark.realtime
@@ -260,6 +260,16 @@ def stopped(pid: int) -> bool:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "T"
     except OSError:
         return False
+
+
+# Every stored scenario
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", [name for name in stored_scenarios() if name.startswith("fault-")])
+def test_every_fault_scenario_passes_its_checks_over_udp(name: str, tmp_path: Path) -> None:
+    outcome = fly(load_scenario(name), FlightOptions(False, tmp_path, port_base=0), Console(quiet=True))
+    assert outcome.passed, [verdict for verdict in outcome.verdicts if not verdict.passed]
 
 
 # Fifty kills
