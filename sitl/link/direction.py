@@ -22,7 +22,10 @@ from sitl.link.impairment import Fate, Impairment, LinkSpec
 from sitl.link.precision import Histogram
 from sitl.link.rules import MAX_RULES, WAYS, Rule, Way, rule_finder
 
-__all__ = ["LATEST", "Counters", "Delivery", "Direction", "Lane", "LinkConfig"]
+__all__ = ["DEFAULT_NAME", "LATEST", "Counters", "Delivery", "Direction", "Lane", "LinkConfig"]
+
+DEFAULT_NAME = "link"
+"""Of a link that is alone."""
 
 LATEST = 1024
 """Deliveries per direction that are remembered, for who looks at the link while it runs."""
@@ -52,7 +55,7 @@ class LinkConfig:
     up: LinkSpec
     down: LinkSpec
     seed: int
-    name: str = "link"
+    name: str = DEFAULT_NAME
     rules: tuple[Rule, ...] = ()
     changes: tuple[Change, ...] = ()
 

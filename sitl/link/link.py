@@ -28,7 +28,7 @@ from autopilot.link.clock import NS_PER_S
 from autopilot.link.node import Datagram, Record
 from gains.table import InputError
 from sitl.link.changes import MAX_CHANGES, Change, format_change
-from sitl.link.direction import Direction, Lane, LinkConfig
+from sitl.link.direction import DEFAULT_NAME, Direction, Lane, LinkConfig
 from sitl.link.gate import Gate, GateStep
 from sitl.link.impairment import Copy, Fate, LinkSpec
 from sitl.link.rules import Way
@@ -129,6 +129,11 @@ class Link:
         """Link time 0 by the node's clock: when the first packet entered, in either direction."""
         self._newest_ns = 0
         """The latest link time that there was: now."""
+
+    @property
+    def title(self) -> str:
+        """What it is called in a sentence."""
+        return "the link" if self.name == DEFAULT_NAME else f"link {self.name}"
 
     @property
     def directions(self) -> tuple[Direction, Direction]:
@@ -249,7 +254,7 @@ class Link:
             "at": at,
             "live": change.live,
         }
-        body = {"kind": "link_change", "node": "relay", "text": f"link {self.name} changes at {at}", "data": data}
+        body = {"kind": "link_change", "node": "relay", "text": f"{self.title} changes at {at}", "data": data}
         self._outbox.records.append(Record("events", t_ns, body))
 
     # Packets
