@@ -17,7 +17,6 @@ from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.linalg import expm
 
 __all__ = [
     "Actuator",
@@ -425,6 +424,8 @@ def zero_order_hold(Ap: Matrix, Bp: Matrix, Ts: float) -> tuple[Matrix, Matrix]:
     A : ndarray, shape (nx, nx)
     B : ndarray, shape (nx, m)
     """
+    from scipy.linalg import expm  # costs 0.2 s, which a program that flies a discrete model need not pay
+
     nx = Ap.shape[0]
     block = np.zeros((2 * nx, 2 * nx))
     block[:nx, :nx] = Ap

@@ -26,10 +26,9 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
-from scipy.special import gammainccinv, gammaincinv, ndtr
 
 __all__ = [
     "JITTERS",
@@ -41,12 +40,20 @@ __all__ = [
     "TableJitter",
     "UniformJitter",
     "autoregressive",
+    "special_functions",
 ]
 
 Source = Callable[[], float]
 """Where numbers come from, one per call."""
 
 _Model = TypeVar("_Model", bound=type)
+
+
+def special_functions() -> Any:
+    """Return :mod:`scipy.special`, whose import would cost every relay 0.2 s at its start; few links need it."""
+    import scipy.special
+
+    return scipy.special
 
 
 class Jitter(ABC):
@@ -130,7 +137,7 @@ class UniformJitter(Jitter):
 
     def correlated(self, normals: Callable[[], Source]) -> Source:
         """Return W Φ(z)."""
-        z, width_ns = normals(), float(self.scale_ns)
+        z, width_ns, ndtr = normals(), float(self.scale_ns), special_functions().ndtr
         return lambda: width_ns * float(ndtr(z()))
 
 
@@ -182,11 +189,13 @@ class GammaJitter(Jitter):
     def correlated(self, normals: Callable[[], Source]) -> Source:
         """Return the quantile of Φ(z), or from P(J > t) = Φ(-z), so that neither tail loses digits."""
         z, shape, theta_ns = normals(), self.shape, self.scale_ns / self.shape
+        special = special_functions()
 
         def jitter_ns() -> float:
             value = z()
-            share = float(ndtr(-abs(value)))
-            return theta_ns * float(gammaincinv(shape, share) if value < 0.0 else gammainccinv(shape, share))
+            share = float(special.ndtr(-abs(value)))
+            quantile = special.gammaincinv if value < 0.0 else special.gammainccinv
+            return theta_ns * float(quantile(shape, share))
 
         return jitter_ns
 
@@ -215,6 +224,7 @@ class ParetoJitter(Jitter):
     def correlated(self, normals: Callable[[], Source]) -> Source:
         """Return the quantile, from P(J > t) = Φ(-z), which loses no digits in the tail."""
         z, power, lambda_ns = normals(), -1.0 / self.shape, self.scale_ns * (self.shape - 1.0)
+        ndtr = special_functions().ndtr
         return lambda: lambda_ns * (float(ndtr(-z())) ** power - 1.0)
 
 
@@ -241,7 +251,7 @@ class ParetoNormalJitter(Jitter):
 
     def correlated(self, normals: Callable[[], Source]) -> Source:
         """Return S Q(Φ(z)) = S (z / 4 + Φ(-z)^(-1/3) - 3/2), which loses no digits in the tail."""
-        z, scale_ns = normals(), float(self.scale_ns)
+        z, scale_ns, ndtr = normals(), float(self.scale_ns), special_functions().ndtr
 
         def jitter_ns() -> float:
             value = z()
@@ -277,7 +287,7 @@ class TableJitter(Jitter):
 
     def correlated(self, normals: Callable[[], Source]) -> Source:
         """Return the quantile of Φ(z)."""
-        z = normals()
+        z, ndtr = normals(), special_functions().ndtr
         return lambda: self._quantile(float(ndtr(z())))
 
     def _quantile(self, share: float) -> float:

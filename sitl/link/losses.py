@@ -15,9 +15,8 @@ from types import MappingProxyType
 from typing import TypeVar
 
 import numpy as np
-from scipy.special import ndtri
 
-from sitl.link.jitters import autoregressive
+from sitl.link.jitters import autoregressive, special_functions
 
 __all__ = ["LOSSES", "CorrelatedLoss", "FourStateLoss", "GilbertElliott", "Loss", "memoryless"]
 
@@ -89,7 +88,7 @@ class CorrelatedLoss(Loss):
 
     def sampler(self, rng: np.random.Generator) -> Callable[[], bool]:
         """Return a source of correlated losses."""
-        z, threshold = autoregressive(rng, self.rho), float(ndtri(self.p))
+        z, threshold = autoregressive(rng, self.rho), float(special_functions().ndtri(self.p))
         return lambda: z() <= threshold
 
 
