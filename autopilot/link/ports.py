@@ -94,6 +94,8 @@ class UdpPort:
         Whom it talks to; None until one is latched.
     strangers : int
         Datagrams of other senders, dropped.
+    empty : int
+        Datagrams of the peer without anything in them, dropped.
     unsent : int
         Datagrams that could not be sent: no peer, or the system refused.
     unstamped : int
@@ -122,6 +124,7 @@ class UdpPort:
         self.socket = sock
         self.peer = peer
         self.strangers = 0
+        self.empty = 0
         self.unsent = 0
         self.unstamped = 0
         self.broken_until_ns = 0
@@ -166,6 +169,7 @@ class UdpPort:
             self.strangers += 1
             return b""
         self._heard_ns = now_ns
+        self.empty += not size
         return bytes(self._buffer[:size])
 
     def came_ns(self, now_ns: int) -> int:

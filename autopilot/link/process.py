@@ -151,6 +151,7 @@ def run_node(
     control: int = 1,
     keyring: Keyring | None = None,
     spin_ns: int = 0,
+    at_end: Callable[[int], None] | None = None,
 ) -> None:
     """Run a node over UDP until Ctrl-C, SIGTERM or the end of the record stream.
 
@@ -176,6 +177,8 @@ def run_node(
         The keys of the ports; it is closed at the end.
     spin_ns : int
         How long before a deadline the driver stops sleeping, as :class:`autopilot.link.udp.UdpDriver` takes it.
+    at_end : callable, optional
+        Called with the node's time when the loop has ended; what the node records then is recorded.
 
     Raises
     ------
@@ -207,6 +210,11 @@ def run_node(
         stack.callback(driver.close)
         driver.on_pass = _chores(driver, keyring, stream)
         driver.run(lambda: stopped or (stream is not None and stream.closed))
+        if at_end is not None:
+            at_end(driver.clock.node_ns(true_ns()))
+            if sink is not None:
+                for record in node.records():
+                    sink.write(record, driver.clock.true_ns(record.t_ns))
         if sink is not None:
             lost = stream.lost if stream is not None else 0
             sink.write(_port_counters(name, ports, lost, driver.clock.node_ns(true_ns())), true_ns())
@@ -260,6 +268,7 @@ def _port_counters(name: str, ports: Sequence[UdpPort], records_lost: int, t_ns:
     data = {
         port.name: {
             "strangers": port.strangers,
+            "empty": port.empty,
             "unsent": port.unsent,
             "overflowed": port.overflowed,
             "unstamped": port.unstamped if port.stamps else None,

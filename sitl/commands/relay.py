@@ -126,7 +126,7 @@ def relay(
     ends = len(openers)
     if control is not None:
         openers.append(partial(answer, CONTROL_PORT, control))
-    run_node("relay", node, openers, options, metadata, tap=False, control=ends, spin_ns=spin_ns)
+    run_node("relay", node, openers, options, metadata, tap=False, control=ends, spin_ns=spin_ns, at_end=node.close)
 
 
 def _one_link(given: Mapping[str, Any], log_rate: int) -> tuple[RelayNode, list[Callable[[], UdpPort]]]:

@@ -114,8 +114,9 @@ class Counters:
             self.lost += 1
 
 
-Delivery = tuple[int, int, int, int]
-"""A copy that left: when (link time, ns), its size, the delay that was asked for and the one it had, ns."""
+Delivery = tuple[int, int, int | None, int]
+"""A copy that left: when (link time, ns), its size, the delay that was asked for (None: the gate chose it) and the one
+it had, ns."""
 
 
 class Lane:
@@ -179,7 +180,7 @@ class Direction:
     errors : Histogram
         How far each delivered copy's delay was from the one asked for; without those that the gate timed.
     latest : deque of Delivery
-        The last ``LATEST`` of these.
+        The last ``LATEST`` copies that left.
     """
 
     __slots__ = (
@@ -244,10 +245,11 @@ class Direction:
         self.next_change_ns = self.changes[0].at_ns if self.changes else _NEVER_NS
         return change
 
-    def delivered(self, now_ns: int, size: int, entered_ns: int, exit_ns: int) -> None:
-        """Note how precise a delivery was: it was to leave at ``exit_ns``, and leaves now."""
-        self.errors.add(now_ns - exit_ns)
-        self.latest.append((now_ns, size, exit_ns - entered_ns, now_ns - entered_ns))
+    def delivered(self, now_ns: int, size: int, entered_ns: int, exit_ns: int | None) -> None:
+        """Note a delivery now, and how precise it was: it was to leave at ``exit_ns``; None when the gate chose."""
+        if exit_ns is not None:
+            self.errors.add(now_ns - exit_ns)
+        self.latest.append((now_ns, size, None if exit_ns is None else exit_ns - entered_ns, now_ns - entered_ns))
 
     def spec_at(self, link_ns: int) -> LinkSpec:
         """Return the SPEC that holds at this time, not before the present."""

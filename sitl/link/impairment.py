@@ -68,9 +68,9 @@ from sitl.link.traces import Trace
 __all__ = ["MAX_QUEUED", "Copy", "Corruption", "Fate", "Impairment", "LinkSpec"]
 
 MAX_QUEUED = 10_000
-"""The most copies under way in one direction; more are refused (tail drop)."""
+"""The most copies under way in one direction, and again in each of its rules; more are refused (tail drop)."""
 
-MAX_PAUSES = 1000
+MAX_PAUSES = 100
 """Pauses that a packet waits for in a row: schedules may overlap so that no time is free, and then it is refused."""
 
 

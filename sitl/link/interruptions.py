@@ -17,6 +17,12 @@ __all__ = ["MIN_MEAN_NS", "Fading", "Handover", "Slots", "Window"]
 MIN_MEAN_NS = 1_000_000
 """The least mean time from one random interruption to the next: each is drawn, also those that no packet meets."""
 
+EPOCH_CYCLES = 10_000
+"""Mean cycles after which a random process begins anew, by its long-run law and with a stream of its own.
+
+So what happens is a function of time alone, and to look far ahead, or after a long silence, takes bounded work.
+"""
+
 
 class Window(NamedTuple):
     """A stretch of time by schedule, [start, start + length), once or again and again.
@@ -66,10 +72,19 @@ class Handover:
 
     def process(self, rng: np.random.Generator) -> Callable[[int], int]:
         """Return a function from an instant to when the link sends next; instants must not fall. It owns ``rng``."""
-        start_ns = round(rng.exponential(self.every_ns))
+        cycle_ns = self.every_ns + self.length_ns
+        epoch_ns, epoch = EPOCH_CYCLES * cycle_ns, 0
+        root, start_ns = rng, round(rng.exponential(self.every_ns))
 
         def resume_ns(link_ns: int) -> int:
-            nonlocal start_ns
+            nonlocal rng, epoch, start_ns
+            if link_ns >= (epoch + 1) * epoch_ns:
+                epoch = link_ns // epoch_ns
+                rng, start_ns = _of_epoch(root, epoch), epoch * epoch_ns
+                if rng.random() * cycle_ns < self.length_ns:
+                    start_ns -= int(rng.random() * self.length_ns)
+                else:
+                    start_ns += round(rng.exponential(self.every_ns))
             while link_ns >= start_ns + self.length_ns:
                 start_ns += self.length_ns + round(rng.exponential(self.every_ns))
             return start_ns + self.length_ns if link_ns >= start_ns else link_ns
@@ -106,11 +121,17 @@ class Fading:
 
     def process(self, rng: np.random.Generator) -> Callable[[int], bool]:
         """Return a function from an instant to whether it is bad; instants must not fall. It owns ``rng``."""
-        is_bad = False
-        end_ns = round(rng.exponential(self.good_ns))
+        cycle_ns = self.good_ns + self.bad_ns
+        epoch_ns, epoch = EPOCH_CYCLES * cycle_ns, 0
+        root, is_bad, end_ns = rng, False, round(rng.exponential(self.good_ns))
 
         def bad_at(link_ns: int) -> bool:
-            nonlocal is_bad, end_ns
+            nonlocal rng, epoch, is_bad, end_ns
+            if link_ns >= (epoch + 1) * epoch_ns:
+                epoch = link_ns // epoch_ns
+                rng = _of_epoch(root, epoch)
+                is_bad = bool(rng.random() * cycle_ns < self.bad_ns)
+                end_ns = epoch * epoch_ns + round(rng.exponential(self.bad_ns if is_bad else self.good_ns))
             while link_ns >= end_ns:
                 is_bad = not is_bad
                 end_ns += round(rng.exponential(self.bad_ns if is_bad else self.good_ns))
@@ -135,3 +156,12 @@ class Slots:
 
     period_ns: int
     packets: int = 0
+
+
+def _of_epoch(root: np.random.Generator, epoch: int) -> np.random.Generator:
+    """Return the stream of an epoch of a process, the same whichever epochs were looked at before."""
+    seeds = root.bit_generator.seed_seq
+    assert isinstance(seeds, np.random.SeedSequence)
+    return np.random.Generator(
+        np.random.PCG64(np.random.SeedSequence(seeds.entropy, spawn_key=(*seeds.spawn_key, epoch)))
+    )

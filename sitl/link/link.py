@@ -36,6 +36,9 @@ from sitl.link.spec import format_spec
 
 __all__ = ["Link", "Outbox"]
 
+MAX_AT_ONCE = 16
+"""Copies that one tick of a stamped link lets out: the next ones leave with the next tick, and are told its time."""
+
 _LONG_AGO_NS = -(1 << 62)
 
 
@@ -182,10 +185,10 @@ class Link:
                 self._settle(packet)
 
     def tick(self, now_ns: int) -> None:
-        """Let out what is due."""
+        """Let out what is due; of a stamped link no more than ``MAX_AT_ONCE`` copies, so that it stays due."""
         if self._begun:
             self._pass_to(now_ns)
-            self._release()
+            self._release(MAX_AT_ONCE if self._stamped else None)
 
     def order(self, specs: Mapping[Way, LinkSpec], now_ns: int) -> list[Change]:
         """Change directions from now on, after every packet that has entered; return the changes.
@@ -259,10 +262,12 @@ class Link:
 
     # Packets
 
-    def _release(self) -> None:
-        """Let out what is due."""
-        heap, now_ns = self._heap, self._newest_ns
-        while heap and heap[0].exit_ns <= now_ns:
+    def _release(self, most: int | None = None) -> None:
+        """Let out what is due, or the first so many copies of it."""
+        heap, now_ns, left = self._heap, self._newest_ns, most
+        while heap and heap[0].exit_ns <= now_ns and left != 0:
+            if left is not None:
+                left -= 1
             packet = heappop(heap)
             packet.direction.queued -= 1
             packet.lane.queued -= 1
@@ -310,8 +315,7 @@ class Link:
             if not late:
                 direction.newest = packet.number
             self._outbox.outgoing.append((direction.exit_port, packet.payload))
-            if not timed:
-                direction.delivered(now_ns, len(packet.payload), packet.entered_ns, packet.exit_ns)
+            direction.delivered(now_ns, len(packet.payload), packet.entered_ns, None if timed else packet.exit_ns)
         t_ns = self._origin_ns + now_ns
         if self._outbox.may_log(t_ns):
             self._outbox.records.append(Record(direction.topic, t_ns, self._body(packet)))

@@ -73,7 +73,7 @@ def _now(direction: Direction, link_ns: int) -> dict[str, Any]:
         "next_changes": [format_change(change) for change in coming[:MAX_CHANGES_SHOWN]],
         "rate_hz": len(recent) * NS_PER_S / span_ns,
         "rate_bps": 8 * sum(size for _, size, _, _ in recent) * NS_PER_S / span_ns,
-        "requested_ns": _quantiles([requested_ns for _, _, requested_ns, _ in latest]),
+        "requested_ns": _quantiles([entry[2] for entry in latest if entry[2] is not None]),
         "achieved_ns": _quantiles([achieved_ns for _, _, _, achieved_ns in latest]),
     }
 

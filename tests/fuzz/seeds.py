@@ -42,7 +42,7 @@ def _zero(message: type) -> object:
     """Return a message of zeros that is addressed to the autopilot."""
     codec = CODECS[message]
     made = codec.message(codec.payload.unpack(bytes(codec.payload.size)))
-    fields = {name: getattr(made, name) for name in message.__slots__}  # type: ignore[attr-defined]
+    fields = {name: getattr(made, name) for name in message.__match_args__}  # type: ignore[attr-defined]
     fields |= {name: 1 for name in ("target_system", "target_component", "target") if name in fields}
     return message(**fields)
 
@@ -114,6 +114,55 @@ def _texts() -> dict[str, dict[str, bytes]]:
         ),
     }
     return {name: {f"{n}": text.encode() for n, text in enumerate(each)} for name, each in words.items()}
+
+
+REQUESTS = (
+    {"id": 1, "do": "show"},
+    {"id": 2, "do": "set", "link": "one", "up": "delay=40ms,jitter=gamma:4ms,loss=ge:0.1:0.3,dup=0.2"},
+    {"id": 3, "do": "set", "link": "two", "preset": "lte", "down": "rate=57600bps,limit=3,slot=20ms:2,order=keep"},
+    {"id": 4, "do": "set", "link": "two", "up": "fade=50ms:20ms:10ms:0.5,handover=100ms:30ms,hold=0s:5ms:20ms"},
+    {"id": 5, "do": "set", "link": "one", "down": "hold=1s:20s:60s,handover=1ms:1ms,rate=9600bps"},
+    {"id": 5, "do": "show", "link": "two"},
+    {"id": 6, "do": "set", "link": "one", "up": "trace=/etc/hostname"},
+    {"id": 7, "do": "set", "link": "three", "up": "loss=1"},
+    {"id": 8, "do": "set", "down": "loss=1"},
+    {"id": 9, "do": "reset"},
+    {"do": "show"},
+)
+"""To the relay of :mod:`tests.fuzz.links`; the last ones are refused."""
+
+RELAY_FILE = """[[link]]
+name = "gcs"
+listen = "127.0.0.1:14701"
+to = "127.0.0.1:14600"
+accept = "any"
+peer = "[::1]:14555"
+seed = 7
+preset = "radio"
+up = "delay=40ms,loss=0.1"
+rules = ["up:ATTITUDE+AOA_SSA:delay=40ms", "down:0:loss=1"]
+changes = ["3s:up:loss=0.5", "1s:down:delay=9ms"]
+[[link]]
+name = "second"
+listen = "127.0.0.1:14702"
+to = "localhost:14601"
+"""
+
+
+def _relays() -> dict[str, dict[str, bytes]]:
+    heard = b"".join(Wire(PLANT, None).encode(message) for message in CONTROL)
+    return {
+        "control": {
+            "requests": b"\n".join(map(orjson.dumps, REQUESTS)),
+            "set": orjson.dumps({"id": 1, "do": "set", "link": "one", "up": "loss=0.5", "down": "corrupt=1:9"}),
+        },
+        "relayfile": {"two": RELAY_FILE.encode(), "one": RELAY_FILE.partition("accept")[0].encode()},
+        "rule": {
+            "plant": b"up:ATTITUDE+AOA_SSA+253:delay=40ms,loss=0.5\n" + heard,
+            "bare": b"down:SERVO_OUTPUT_RAW:dup=1.0",
+        },
+        "change": {"0": b"3s:up:loss=0.5", "1": b"1234567ns:down:fade=5s:500ms:80ms:0.05,order=keep"},
+    }
 
 
 def _json() -> dict[str, dict[str, bytes]]:
@@ -270,7 +319,7 @@ def _datagrams() -> dict[str, dict[str, bytes]]:
 def seeds() -> Iterator[tuple[str, str, bytes]]:
     """Yield target, name and content of each sample."""
     tables: tuple[Mapping[str, Mapping[str, bytes]], ...] = (
-        *(_datagrams(), _scripts(), _texts(), _json(), _files(), _traces()),
+        *(_datagrams(), _scripts(), _texts(), _json(), _files(), _traces(), _relays()),
     )
     for table in tables:
         for target, samples in table.items():

@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from tests.fuzz import files, nodes, texts, wires
+from tests.fuzz import files, links, nodes, texts, wires
 from tests.fuzz.refusing import Run
 
 CORPUS = Path(__file__).parent / "corpus"
@@ -45,6 +45,12 @@ _CERTIFICATE = (
 )
 _FRAMES = (b"\xfd", b"\xfe", b"\x01\x01", b"\x01\x19", b"\xff" * 8, b"\x00\x00\xc0\x7f", b"\x00\x00\x80\xff", b"\x7f")
 
+_SPEC = (
+    *(b"delay=", b"jitter=", b"loss=", b"dup=", b"reorder=", b"order=keep", b"rate=", b"corr=", b"gap=", b"slot="),
+    *(b"corrupt=", b"limit=", b"blackout=", b"hold=", b"handover=", b"fade=", b"gamma:", b"pareto:", b"ge:"),
+    *(b"uniform:", b"ms", b"us", b"ns", b"kbps", b":", b",", *_NUMBERS, *_ODD),
+)
+
 
 @dataclass(frozen=True, slots=True)
 class Target:
@@ -74,34 +80,28 @@ TARGETS: Mapping[str, Target] = {
         texts.order, (b"order", b"step_clock", b"by_ns", b"drift_ppb", b"for_ns", b"move_peer", b"number", *_JSON)
     ),
     "stream": Target(texts.stream, (b'"hello"', b'"plant"', b'"token"', b'"t"', b'"ports"', *_JSON)),
-    "spec": Target(
-        texts.spec,
+    "spec": Target(texts.spec, _SPEC),
+    "rule": Target(links.rule, (b"up:", b"down:", b"ATTITUDE", b"+", b"253", b":", b"\n", *_FRAMES, *_SPEC)),
+    "change": Target(links.change, (b"3s:", b"up:", b"down:", *_SPEC)),
+    "control": Target(
+        links.control,
         (
             *(
-                b"delay=",
-                b"jitter=",
-                b"loss=",
-                b"dup=",
-                b"reorder=",
-                b"order=keep",
-                b"rate=",
-                b"corr=",
-                b"gap=",
-                b"slot=",
+                b'{"id":1,"do":"set",',
+                b'{"id":2,"do":"show"',
+                b'"link":"one"',
+                b'"preset":"lte"',
+                b'"up":"',
+                b'"down":"',
             ),
-            *(
-                b"slot=",
-                b"corrupt=",
-                b"limit=",
-                b"blackout=",
-                b"hold=",
-                b"handover=",
-                b"fade=",
-                b"gamma:",
-                b"pareto:",
-                b"ge:",
-            ),
-            *(b"uniform:", b"ms", b"us", b"ns", b"kbps", b":", b",", *_NUMBERS, *_ODD),
+            *(b"trace=", b"table:", b"/etc/hostname", b"\\u0000", *_JSON, *_SPEC),
+        ),
+    ),
+    "relayfile": Target(
+        links.relayfile,
+        (
+            *(b"[[link]]\n", b'name = "', b'listen = "127.0.0.1:1"\n', b'to = "[::1]:2"\n', b'peer = "', b"seed = "),
+            *(b'preset = "lte"\n', b'up = "', b'rules = ["up:0:', b'changes = ["3s:up:', b'accept = "any"\n', *_SPEC),
         ),
     ),
     "fault": Target(

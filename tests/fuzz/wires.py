@@ -120,4 +120,4 @@ def _check_round_trip(sender: Source, message: object) -> None:
 
 
 def _values(message: object) -> list[object]:
-    return [getattr(message, name) for name in type(message).__slots__]  # type: ignore[attr-defined]
+    return [getattr(message, name) for name in type(message).__match_args__]  # type: ignore[attr-defined]

@@ -73,6 +73,31 @@ def test_the_nth_change_draws_from_the_stream_that_is_documented():
     assert set(fates) == {Fate.DELIVERED, Fate.LOST}
 
 
+def test_of_several_changes_that_are_due_all_are_made_and_the_last_one_holds():
+    changes = [parse_change(text) for text in ("2ms:up:delay=9ms", "1ms:up:delay=1s", "2ms:up:delay=3ms")]
+    flight = Flight(PERFECT, PERFECT, changes=changes)
+    flight.send("plant", b"a", 0)
+    flight.send("plant", b"b", 5 * MS)
+    flight.finish()
+    assert flight.left == [(0, "autopilot", b"a"), (8 * MS, "autopilot", b"b")]
+    assert [event.body["data"]["spec"] for event in events(flight, "link_change")] == [
+        "delay=1s",
+        "delay=9ms",
+        "delay=3ms",
+    ]
+
+
+def test_a_live_change_at_the_instant_of_a_planned_one_comes_after_it_and_says_so():
+    planned = ["10ms:up:delay=1ms", "10000001ns:up:delay=2ms", "10000002ns:down:delay=3ms"]
+    flight = Flight(PERFECT, PERFECT, changes=[parse_change(text) for text in planned])
+    flight.send("plant", b"a", 0)
+    assert request(flight, 10 * MS, do="set", up="delay=30ms")["at"] == ["10000002ns:up:delay=30ms"]
+    flight.send("plant", b"b", 10 * MS)
+    flight.send("plant", b"c", 11 * MS)
+    flight.finish()
+    assert flight.left[1:] == [(11 * MS, "autopilot", b"b"), (41 * MS, "autopilot", b"c")]
+
+
 def test_a_change_of_one_direction_leaves_the_other_as_it_was():
     plain = fly(BUSY, BUSY, both_ways(200))
     changed = fly(BUSY, BUSY, both_ways(200), changes=[parse_change("1s:up:loss=1")])

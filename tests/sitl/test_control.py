@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import json
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from gains.table import InputError
+from sitl.link.changes import Change, parse_change
 from sitl.link.control import (
     MAX_ID,
     MAX_REPLY_BYTES,
@@ -26,6 +28,7 @@ from sitl.link.direction import LinkConfig
 from sitl.link.presets import PRESETS
 from sitl.link.relay import RelayNode
 from sitl.link.spec import parse_spec
+from sitl.link.status import MAX_CHANGES_SHOWN
 from tests.sitl.relays import MS, PERFECT, S
 
 json_values = st.recursive(
@@ -104,6 +107,12 @@ def test_what_has_no_readable_id_is_refused_without_one(datagram):
     refused = decode_request(datagram)
     assert isinstance(refused, Refused)
     assert refused.id is None
+
+
+def test_a_request_may_be_as_long_as_is_said_and_no_longer():
+    request = b'{"id":1,"do":"show"}'
+    assert decode_request(request.ljust(MAX_REQUEST_BYTES)) == Show(1, None)
+    assert isinstance(decode_request(request.ljust(MAX_REQUEST_BYTES + 1)), Refused)
 
 
 @pytest.mark.parametrize(
@@ -213,6 +222,43 @@ def test_show_tells_specs_counters_rates_and_delays():
     assert MS <= up["error_ns"]["p50"] <= up["error_ns"]["max"] == MS
     assert (up["rate_hz"], up["rate_bps"]) == (40.0, 16_000.0)
     assert (down["rate_hz"], down["achieved_ns"], down["error_ns"]) == (0.0, None, None)
+
+
+def test_the_rate_is_that_of_the_last_second_or_of_the_latest_deliveries_when_there_are_too_many():
+    relay = RelayNode(PERFECT, PERFECT, 1)
+    for n in range(4001):  # 4 kHz up, 100 Hz down
+        relay.receive("plant", bytes(25), n * MS // 4)
+        if n % 40 == 0:
+            relay.receive("autopilot", bytes(25), n * MS // 4)
+    relay.outgoing()
+    status = answers(relay, {"id": 1, "do": "show"}, 1 * S)[0]["links"]["link"]
+    assert status["up"]["rate_hz"] == pytest.approx(4000, rel=0.002)
+    assert status["up"]["rate_bps"] == pytest.approx(800_000, rel=0.002)
+    assert (status["down"]["rate_hz"], status["down"]["rate_bps"]) == (100.0, 20_000.0)
+    later = answers(relay, {"id": 1, "do": "show"}, 3 * S)[0]["links"]["link"]
+    assert (later["up"]["rate_hz"], later["down"]["rate_hz"]) == (0.0, 0.0)
+
+
+def test_the_delays_shown_are_quantiles_by_nearest_rank():
+    relay = RelayNode(parse_spec("delay=1ms"), PERFECT, 1)
+    achieved = [MS + n * 10_000 for n in range(150)]
+    for n, achieved_ns in enumerate(achieved):
+        relay.receive("plant", b"x", n * 10 * MS)
+        relay.tick(n * 10 * MS + achieved_ns)
+    relay.outgoing()
+    up = answers(relay, {"id": 1, "do": "show"}, 2 * S)[0]["links"]["link"]["up"]
+    assert up["requested_ns"] == {"p50": MS, "p99": MS}
+    assert up["achieved_ns"] == {
+        f"p{part}": np.quantile(achieved, part / 100, method="inverted_cdf") for part in (50, 99)
+    }
+
+
+def test_show_tells_the_first_of_many_changes_to_come_and_how_many_there_are():
+    changes = [Change((1 + n) * S, "up", parse_spec(f"delay={n}ms")) for n in range(MAX_CHANGES_SHOWN + 4)]
+    relay = RelayNode(PERFECT, PERFECT, 1, changes=changes)
+    up = answers(relay, {"id": 1, "do": "show"})[0]["links"]["link"]["up"]
+    assert up["changes"] == MAX_CHANGES_SHOWN + 4
+    assert [parse_change(text) for text in up["next_changes"]] == changes[:MAX_CHANGES_SHOWN]
 
 
 def test_show_tells_the_changes_to_come_and_the_spec_that_holds():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict, replace
+from itertools import product
 from typing import Any
 
 import jsonschema
@@ -27,10 +28,12 @@ from gains.witnessfile import Witness
 from sitl.link.changes import Change
 from sitl.link.direction import LinkConfig
 from sitl.link.gate import Gate
-from sitl.link.impairment import MAX_QUEUED
+from sitl.link.impairment import MAX_QUEUED, Impairment
+from sitl.link.link import MAX_AT_ONCE
 from sitl.link.relay import Counters, RelayNode
 from sitl.link.rules import WAYS, Rule, parse_rule
 from sitl.link.spec import parse_spec
+from sitl.link.status import link_counters, link_status
 from tests.helpers import HEARTBEAT
 from tests.sitl.relays import (
     ENTRY,
@@ -491,6 +494,95 @@ def test_no_more_packets_are_recorded_in_a_second_than_asked_for_and_the_others_
     assert flight.relay.counters["up"].delivered == 250
 
 
+def test_a_clock_that_is_set_back_neither_stops_the_log_nor_the_counters():
+    flight = Flight(PERFECT, PERFECT, log_rate=10)
+    for n in range(40):
+        flight.relay.receive("plant", b"x", 100 * S + n * 100 * MS - (50 * S if n >= 20 else 0))
+        flight.take(0)
+    assert len(of(flight, "up")) == 40
+    told = [event.t_ns // S for event in events(flight, "counters")]
+    assert told == [101, 52, 53]
+    assert events(flight, "counters")[0].body["data"]["links"]["link"].get("clock_steps") is None
+    assert events(flight, "counters")[-1].body["data"]["links"]["link"]["clock_steps"] == 1
+
+
+def test_the_counters_are_told_while_packets_only_leave():
+    flight = Flight("delay=1500ms", PERFECT)
+    flight.send("plant", b"a", 0)
+    flight.send("plant", b"b", 900 * MS)
+    flight.finish()
+    told = [(event.t_ns, event.body["data"]["links"]["link"]["up"]) for event in events(flight, "counters")]
+    assert [(t_ns, up["delivered"], up["queued"]) for t_ns, up in told] == [(1500 * MS, 1, 1)]
+
+
+def test_each_rule_draws_from_the_stream_that_is_documented():
+    rules = [parse_rule(f"{way}:{messages}:loss=0.5") for way in WAYS for messages in ("HEARTBEAT", "TIMESYNC")]
+    flight = Flight(PERFECT, PERFECT, 9, rules=rules)
+    wire = Wire(PLANT, AUTOPILOT)
+    frames = {"HEARTBEAT": wire.encode(HEARTBEAT), "TIMESYNC": wire.encode(Timesync(0, 5))}
+    for n in range(40):
+        for way, payload in product(WAYS, frames.values()):
+            flight.send(ENTRY[way], payload, n * MS)
+    for (i, way), (k, name) in product(enumerate(WAYS), enumerate(frames)):
+        rng = np.random.Generator(np.random.PCG64(np.random.SeedSequence(9, spawn_key=(3, i, k))))
+        link = Impairment(parse_spec("loss=0.5"), rng)
+        fates = [record.body["fate"] for record in of(flight, way) if record.body["rule"] == name]
+        assert fates == [link.step(1, n * MS)[0].fate for n in range(40)]
+
+
+def test_a_direction_counts_the_packets_of_its_rules_and_a_rule_its_own():
+    wire = Wire(PLANT, AUTOPILOT)
+    flight = Flight("delay=1ms", PERFECT, rules=[parse_rule("up:HEARTBEAT:delay=9ms")], log_rate=4)
+    for n in range(3):
+        flight.send("plant", wire.encode(HEARTBEAT), n)
+        flight.send("plant", wire.encode(Timesync(0, 5)), n)
+    direction = flight.relay._links[0].up
+    assert (direction.queued, direction.rules[0].queued) == (6, 3)
+    assert link_counters(flight.relay._links[0])["up"]["queued"] == 6
+    flight.finish()
+    up = link_counters(flight.relay._links[0])["up"]
+    (rule,) = up["rules"]
+    names = ("sent", "delivered", "reordered", "unlogged", "queued")
+    assert [up[name] for name in names] == [6, 6, 3, 2, 0]
+    assert [rule[name] for name in names] == [3, 3, 3, 2, 0]
+
+
+def test_what_is_due_at_once_leaves_in_parts_each_of_which_knows_when():
+    """Letting out a thousand packets takes longer than a thousand packets may be late unnoticed."""
+    relay = RelayNode(parse_spec("hold=0s:1s"), PERFECT, 1, stamped=True)
+    for n in range(3 * MAX_AT_ONCE):
+        relay.receive("plant", bytes([n]), n)
+    left = []
+    for part in range(3):
+        assert relay.next_deadline_ns() == S
+        relay.tick(S + part * MS)
+        left += [payload for _, payload in relay.outgoing()]
+        assert len(left) == (part + 1) * MAX_AT_ONCE
+    assert left == [bytes([n]) for n in range(3 * MAX_AT_ONCE)]
+    assert relay.next_deadline_ns() is None
+    delivered_ns = [record.body["delivered_ns"] - S for record in relay.records() if record.topic == "link/up"]
+    assert delivered_ns == [part * MS for part in range(3) for _ in range(MAX_AT_ONCE)]
+    assert relay._links[0].up.errors.largest_ns == 2 * MS
+
+
+def test_what_the_gate_timed_tells_nothing_of_precision():
+    flight = Flight(PERFECT, "delay=5ms", gate=Gate(WITNESS))
+    plant, autopilot = Wire(PLANT, AUTOPILOT), Wire(AUTOPILOT, PLANT)
+    flight.send("plant", plant.encode(NamedValueInt(0, "SAMPLE_K", 0)), 0)
+    for k in range(4):
+        flight.send("plant", plant.encode(Attitude(25 * k, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)), 25 * k * MS)
+        flight.send("autopilot", autopilot.encode(ServoOutputRaw(25_000 * k, 1500)), (25 * k + 1) * MS)
+    flight.finish()
+    down = flight.relay._links[0].down
+    assert (down.counters.delivered, down.errors.count) == (3, 0)
+    status = link_status(flight.relay._links[0], 80 * MS)["down"]
+    assert (status["rate_hz"], status["requested_ns"]) == (3.0, None)
+    assert status["achieved_ns"] == {"p50": 24 * MS, "p99": 24 * MS}
+    flight.send("autopilot", autopilot.encode(Timesync(0, 5)), S)
+    flight.finish()
+    assert (down.counters.delivered, down.errors.summary()) == (4, {"p50": 0, "p99": 0, "max": 0})
+
+
 def test_a_record_with_all_that_may_be_in_it_fits_its_schema_and_one_of_a_wrong_type_does_not():
     flight = Flight("loss=1", PERFECT, rules=[parse_rule("up:HEARTBEAT:corrupt=1")])
     flight.send("plant", Wire(PLANT, AUTOPILOT).encode(HEARTBEAT), 0)
@@ -554,6 +646,29 @@ def test_several_links_have_their_own_ports_topics_and_beginnings():
         "two/up": 1,
         "two/down": 1,
     }
+
+
+def test_of_several_links_the_one_whose_packet_leaves_first_is_served_first():
+    fast, slow = parse_spec("delay=2ms"), parse_spec("delay=9ms")
+    relay = RelayNode.joining([LinkConfig(slow, slow, 1, "slow"), LinkConfig(fast, fast, 2, "fast")])
+    relay.receive("slow/plant", b"a", 0)
+    relay.receive("fast/plant", b"b", 1 * MS)
+    left = []
+    while (due_ns := relay.next_deadline_ns()) is not None:
+        relay.tick(due_ns)
+        left += [(due_ns, *datagram) for datagram in relay.outgoing()]
+    assert left == [(3 * MS, "fast/autopilot", b"b"), (9 * MS, "slow/autopilot", b"a")]
+
+
+def test_all_links_of_a_relay_share_what_may_be_recorded_in_a_second():
+    relay = two_links(log_rate=5)
+    for n in range(4):
+        relay.receive("one/plant", b"x", n)
+        relay.receive("two/plant", b"x", n)
+    relay.tick(10 * MS)
+    packets = [record.topic for record in relay.records() if record.topic != "events"]
+    assert len(packets) == 5
+    assert sum(counters.unlogged for counters in relay.counters.values()) == 3
 
 
 def test_a_link_does_the_same_beside_others_as_alone():

@@ -75,6 +75,7 @@ def test_by_default_it_is_one_perfect_link_without_control(started):
     result = sitl()
     assert result.exit_code == 0, result.output
     ((node, openers, metadata, more),) = started
+    assert more.pop("at_end") == node.close
     assert more == {"tap": False, "control": 2, "spin_ns": DEFAULT_SPIN_NS}
     assert [(opener.args[0], opener.args[1]) for opener in openers] == [
         ("autopilot", ("127.0.0.1", 14601)),

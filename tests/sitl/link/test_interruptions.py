@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from scipy import linalg, stats
 
 from sitl.link.impairment import MAX_PAUSES, Copy, Fate, Impairment, LinkSpec
-from sitl.link.interruptions import MIN_MEAN_NS, Fading, Handover, Slots, Window
+from sitl.link.interruptions import EPOCH_CYCLES, MIN_MEAN_NS, Fading, Handover, Slots, Window
 from tests.sitl.links import MS, S, impairment
 
 # ------------------------------------------------------------------------------------------------- windows
@@ -303,3 +303,32 @@ def test_interruptions_at_shorter_means_than_the_least_are_refused():
     ):
         with pytest.raises(AssertionError):
             make()
+
+
+PROCESSES = pytest.mark.parametrize(
+    ("process", "first_ns", "second_ns"),
+    [(Handover(2 * MS, 1 * MS), 2 * MS, 1 * MS), (Fading(2 * MS, 3 * MS, 0), 2 * MS, 3 * MS)],
+    ids=["handover", "fading"],
+)
+
+
+@PROCESSES
+def test_what_happens_in_time_is_the_same_whoever_looks_and_however_far_ahead(process, first_ns, second_ns):
+    epoch_ns = EPOCH_CYCLES * (first_ns + second_ns)
+    rng = np.random.default_rng(5)
+    instants = sorted({*rng.integers(0, 4 * epoch_ns, 2000).tolist(), 3 * epoch_ns, 10**6 * S})
+    often, rarely = (process.process(np.random.default_rng(1)) for _ in range(2))
+    seen = {at_ns: often(at_ns) for at_ns in instants}  # the last one is hundreds of millions of interruptions away
+    assert {at_ns: rarely(at_ns) for at_ns in instants[::7]} == {at_ns: seen[at_ns] for at_ns in instants[::7]}
+    assert len(set(seen.values())) > 1
+
+
+@PROCESSES
+def test_an_epoch_begins_within_an_interruption_as_often_as_these_take_their_share_of_the_time(
+    process, first_ns, second_ns
+):
+    instants = [n * EPOCH_CYCLES * (first_ns + second_ns) for n in range(1, 2001)]
+    look = process.process(np.random.default_rng(1))
+    inside = [look(at_ns) not in (at_ns, False) for at_ns in instants]
+    share = second_ns / (first_ns + second_ns)
+    assert abs(np.mean(inside) - share) < 4 * np.sqrt(share * (1 - share) / len(instants))
