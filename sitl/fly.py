@@ -23,6 +23,9 @@ from sitl.faults import DiskFull, Fault
 from sitl.flight import fly_virtual
 from sitl.flightdata import FlightData
 from sitl.injector import Injector, check_feasible
+from sitl.link.changes import format_change
+from sitl.link.rules import format_rule
+from sitl.link.spec import format_spec
 from sitl.processes import ChildDied, FlightFailed, Supervisor
 from sitl.programs import DEFAULT_PORT_BASE, FlightOptions, start_programs
 from sitl.recorder import FlightRecorder
@@ -99,6 +102,10 @@ def _metadata(scenario: Scenario, options: FlightOptions) -> dict[str, str]:
         "Ts": repr(scenario.plant.Ts),
         "actuator": scenario.actuator,
         "reference": scenario.reference,
+        "up": format_spec(scenario.up),
+        "down": format_spec(scenario.down),
+        **({"rules": " ".join(map(format_rule, scenario.rules))} if scenario.rules else {}),
+        **({"changes": " ".join(map(format_change, scenario.changes))} if scenario.changes else {}),
         **({} if scenario.witness_name is None else {"witness": Path(scenario.witness_name).name}),
         "time": "virtual" if options.virtual else "udp",
         "lagproof": version(),

@@ -11,6 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from autopilot.link.ports import Address
 from gains.store import resolve
 from gains.table import InputError
 from sitl.processes import ChildDied, Supervisor
@@ -44,6 +45,8 @@ class FlightOptions:
         Options of the autopilot that are about ground stations, over UDP.
     key_file, gcs_key_file : Path or None
         Keys of the control link and of the ground stations' links, over UDP.
+    control : Address or None
+        Where the relay takes requests, over UDP.
     """
 
     virtual: bool
@@ -53,6 +56,7 @@ class FlightOptions:
     ground_arguments: tuple[str, ...] = ()
     key_file: Path | None = None
     gcs_key_file: Path | None = None
+    control: Address | None = None
 
 
 @dataclass(slots=True)
@@ -82,7 +86,9 @@ class Programs:
     def relay(self) -> list[str]:
         """Return what to start as the relay."""
         ports = ["--listen", f"127.0.0.1:{self.relay_port}", "--to", f"127.0.0.1:{self.plant_port}"]
-        return ["sitl", "relay", *ports, *relay_arguments(self.scenario)]
+        control = self.options.control
+        asked = [] if control is None else [f"--control={control[0]}:{control[1]}"]
+        return ["sitl", "relay", *ports, *asked, *relay_arguments(self.scenario)]
 
     def autopilot(self, gains_name: str | None = None) -> list[str]:
         """Return what to start as the autopilot, by default with the scenario's gains."""

@@ -7,7 +7,7 @@ from a scenario, for either driver, and writes the command lines that build the 
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from importlib import resources
 from pathlib import Path
@@ -29,10 +29,13 @@ from gains.table import InputError, Table
 from gains.witnessfile import Witness, read_witness
 from sitl.aircraft.disturbance import HarmonicGust, SquareDelta
 from sitl.faults import Fault, aircraft_faults, check_faults, format_fault, parse_fault
+from sitl.link.changes import Change, format_change
 from sitl.link.gate import Gate, check_flyable
 from sitl.link.impairment import LinkSpec
 from sitl.link.presets import parse_link
 from sitl.link.relay import DEFAULT_LOG_RATE, RelayNode
+from sitl.link.relayfile import parse_changes, parse_rules
+from sitl.link.rules import Rule, format_rule
 from sitl.link.spec import format_spec
 from sitl.plant import PlantConfig, PlantNode
 from sitl.seeds import MAX_SEED
@@ -162,6 +165,10 @@ class Scenario:
         That sequence.
     faults : tuple of Fault
         What goes wrong, and when.
+    rules : tuple of Rule
+        Messages that meet another link than the rest of their direction.
+    changes : tuple of Change
+        What changes on the link in flight, by link time; a relay that starts again begins to count anew.
     checks : tuple of Check
         What must hold at the end.
     variants : mapping
@@ -193,6 +200,8 @@ class Scenario:
     witness_name: str | None = None
     witness: Witness | None = None
     faults: tuple[Fault, ...] = ()
+    rules: tuple[Rule, ...] = ()
+    changes: tuple[Change, ...] = ()
     checks: tuple[Check, ...] = ()
     variants: Mapping[str, Scenario] = field(default_factory=dict)
 
@@ -232,7 +241,13 @@ class Scenario:
     def relay_node(self, *, log_rate: int = DEFAULT_LOG_RATE) -> RelayNode:
         """Return the relay, new, which records at most so many packets a second."""
         return RelayNode(
-            self.up, self.down, self.seed, None if self.witness is None else Gate(self.witness), log_rate=log_rate
+            self.up,
+            self.down,
+            self.seed,
+            None if self.witness is None else Gate(self.witness),
+            rules=self.rules,
+            changes=self.changes,
+            log_rate=log_rate,
         )
 
     def autopilot_node(self, ground_stations: int) -> AutopilotNode:
@@ -320,6 +335,8 @@ def _parse(table: Table, name: str, gains_name: str | None, plant_name: str | No
         delta=_delta(table, plant),
         witness_name=witness_name,
         witness=witness,
+        rules=parse_rules(_texts(link, "rules"), "link.rules"),
+        changes=parse_changes(_texts(link, "changes"), "link.changes"),
         checks=tuple(
             _check(check, METRICS if witness is None else METRICS | WITNESS_METRICS, tuple(variants or ()))
             for check in table.tables("check", default=())
@@ -383,6 +400,11 @@ def _delta(table: Table, plant: Model) -> SquareDelta | None:
     return SquareDelta(delta.number("amplitude", default=0.15), delta.integer("half_period", default=20, low=1))
 
 
+def _texts(link: Table | None, key: str) -> Sequence[str]:
+    """Return a list of ``[link]``, empty without the key."""
+    return () if link is None else link.strings(key, default=())
+
+
 def _faults(table: Table) -> list[Fault]:
     """Return the faults of the file, none without the key."""
     return [parse_fault(text) for text in table.strings("faults", default=())]
@@ -442,6 +464,8 @@ def relay_arguments(scenario: Scenario) -> list[str]:
     arguments = ["--up", format_spec(scenario.up), "--down", format_spec(scenario.down)]
     if scenario.witness_name is not None:
         arguments += ["--witness", scenario.witness_name]
+    arguments += [word for rule in scenario.rules for word in ("--rule", format_rule(rule))]
+    arguments += [word for change in scenario.changes for word in ("--at", format_change(change))]
     return [*arguments, "--seed", str(scenario.seed), "--clock", format_clock(scenario.clocks["relay"])]
 
 

@@ -14,7 +14,7 @@ from rich.console import Console
 from autopilot.link.clock import NS_PER_S
 from autopilot.link.keyfile import read_key
 from autopilot.link.process import ADDRESS
-from autopilot.link.udp import dial, true_ns
+from autopilot.link.udp import Address, dial, true_ns
 from autopilot.profile import parse_profile
 from gains.command import NEGATIVE, SUCCESS, FiniteRange, print_json
 from gains.table import InputError
@@ -22,7 +22,11 @@ from sitl.commands.links import link_options
 from sitl.commands.options import FILE, SEED
 from sitl.faults import parse_fault
 from sitl.fly import FlightOptions, Outcome, fly
+from sitl.link.changes import format_change
+from sitl.link.control import DEFAULT_CONTROL
 from sitl.link.presets import parse_link
+from sitl.link.relayfile import parse_changes, parse_rules
+from sitl.link.rules import format_rule
 from sitl.link.spec import parse_spec
 from sitl.processes import FlightFailed
 from sitl.programs import DEFAULT_PORT_BASE
@@ -59,6 +63,12 @@ def _report(path: Path | None, name: str, start_ns: int, came_to: Outcome | str)
 @click.option("--plant", "plant_name", help="Another plant than the scenario's.")
 @click.option("--gains", "gains_name", help="Other gains than the scenario's.")
 @link_options
+@click.option("--rule", "rules", multiple=True,
+              help="Another link for some messages, as in up:ATTITUDE:delay=40ms; may be repeated.")  # fmt: skip
+@click.option("--at", "changes_at", multiple=True,
+              help="A change more of the link in flight, as in 3s:up:loss=0.5; may be repeated.")  # fmt: skip
+@click.option("--control", type=ADDRESS, is_flag=False, flag_value=DEFAULT_CONTROL, metavar="[ADDRESS]",
+              help=f'Let "sitl relay set" change the link in flight, at {DEFAULT_CONTROL} or elsewhere.')  # fmt: skip
 @click.option("--seed", type=SEED, help="Of everything random.")
 @click.option("--duration", type=FiniteRange(0.0, 86_400.0, min_open=True), help="Seconds.")
 @click.option("--virtual", is_flag=True, help="In virtual time: one process, no socket, much faster.")
@@ -93,6 +103,7 @@ def fly_command(
     wait_arm: bool,
     key_file: Path | None,
     gcs_key_file: Path | None,
+    control: Address | None,
     port_base: int,
     as_json: bool,
     junit: Path | None,
@@ -110,13 +121,15 @@ def fly_command(
     if virtual and (wait_arm or key_file or gcs_key_file or alternatives or parameters_file):
         options = "--wait-arm, --key, --gcs-key, --alternative, --parameters"
         raise InputError(f"--virtual: expected none of {options}: there is no ground station in virtual time")
+    if virtual and control is not None:
+        raise InputError("--control: expected none with --virtual, which is over before anybody could ask: see --at")
     for path in filter(None, (key_file, gcs_key_file)):
         read_key(path)  # refused now rather than by a program
     folder = out or _new_folder(f"{scenario.name}-{datetime.now():%Y%m%d-%H%M%S}")
     ground = ["--wait-arm"] if wait_arm else []
     ground += [word for name in alternatives for word in ("--alternative", name)]
     ground += [] if parameters_file is None else ["--parameters", str(parameters_file)]
-    flight = FlightOptions(virtual, folder, stations, port_base, tuple(ground), key_file, gcs_key_file)
+    flight = FlightOptions(virtual, folder, stations, port_base, tuple(ground), key_file, gcs_key_file, control)
     console = Console(stderr=True)
     start_ns = true_ns()
     try:
@@ -154,6 +167,9 @@ def _changed(
 ) -> Scenario:
     """Return the scenario with what the command line changes; its variants change alike."""
     faults = tuple(parse_fault(text) for text in changes.pop("faults", ()))
+    rules, changes_at = changes.pop("rules", ()), changes.pop("changes_at", ())
+    rules = parse_rules((*map(format_rule, scenario.rules), *rules), "--rule")
+    changes_at = parse_changes((*map(format_change, scenario.changes), *changes_at), "--at")
     given = {name: value for name, value in changes.items() if value is not None}
     if "reference" in given:
         parse_profile(given["reference"], scenario.gains.model.Ts)  # refused now rather than by a program
@@ -164,7 +180,7 @@ def _changed(
     given |= {way: parse_spec(text) for way, text in (("up", up), ("down", down)) if text is not None}
 
     def changed(one: Scenario) -> Scenario:
-        return replace(one, **given).with_faults((*one.faults, *faults))
+        return replace(one, rules=rules, changes=changes_at, **given).with_faults((*one.faults, *faults))
 
     variants = {name: changed(variant) for name, variant in scenario.variants.items()}
     return replace(changed(scenario), variants=variants)
