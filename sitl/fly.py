@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import signal
 import tempfile
 from collections.abc import Callable, Iterator, Mapping
@@ -104,8 +105,8 @@ def _metadata(scenario: Scenario, options: FlightOptions) -> dict[str, str]:
         "reference": scenario.reference,
         "up": format_spec(scenario.up),
         "down": format_spec(scenario.down),
-        **({"rules": " ".join(map(format_rule, scenario.rules))} if scenario.rules else {}),
-        **({"changes": " ".join(map(format_change, scenario.changes))} if scenario.changes else {}),
+        **({"rules": shlex.join(map(format_rule, scenario.rules))} if scenario.rules else {}),
+        **({"changes": shlex.join(map(format_change, scenario.changes))} if scenario.changes else {}),
         **({} if scenario.witness_name is None else {"witness": Path(scenario.witness_name).name}),
         "time": "virtual" if options.virtual else "udp",
         "lagproof": version(),

@@ -14,8 +14,9 @@ from pathlib import Path
 from autopilot.link.ports import Address
 from gains.store import resolve
 from gains.table import InputError
+from sitl.arguments import autopilot_arguments, plant_arguments, relay_arguments
 from sitl.processes import ChildDied, Supervisor
-from sitl.scenario import Scenario, autopilot_arguments, plant_arguments, relay_arguments
+from sitl.scenario import Scenario
 
 __all__ = ["DEFAULT_PORT_BASE", "FlightOptions", "Programs", "damaged", "start_programs"]
 

@@ -7,7 +7,7 @@ from a scenario, for either driver, and writes the command lines that build the 
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from importlib import resources
 from pathlib import Path
@@ -21,32 +21,28 @@ from autopilot.app import AutopilotNode
 from autopilot.config import AutopilotConfig
 from autopilot.failsafe import Mode
 from autopilot.link.clock import NS_PER_S, Clock
-from autopilot.link.process import format_clock, parse_clock
+from autopilot.link.process import parse_clock
 from autopilot.profile import parse_profile
 from gains.model import GainLaw, Model
 from gains.store import load_law, load_model
 from gains.table import InputError, Table
 from gains.witnessfile import Witness, read_witness
 from sitl.aircraft.disturbance import HarmonicGust, SquareDelta
-from sitl.faults import Fault, aircraft_faults, check_faults, format_fault, parse_fault
-from sitl.link.changes import Change, format_change
+from sitl.faults import Fault, aircraft_faults, check_faults, parse_fault
+from sitl.link.changes import MAX_CHANGES, Change, format_change, format_time, parse_change
 from sitl.link.gate import Gate, check_flyable
 from sitl.link.impairment import LinkSpec
 from sitl.link.presets import parse_link
 from sitl.link.relay import DEFAULT_LOG_RATE, RelayNode
-from sitl.link.relayfile import parse_changes, parse_rules
-from sitl.link.rules import Rule, format_rule
-from sitl.link.spec import format_spec
+from sitl.link.rules import MAX_RULES, Rule, parse_rule
 from sitl.plant import PlantConfig, PlantNode
 from sitl.seeds import MAX_SEED
 
 __all__ = [
     "Check",
     "Scenario",
-    "autopilot_arguments",
+    "check_changes",
     "load_scenario",
-    "plant_arguments",
-    "relay_arguments",
     "stored_scenarios",
 ]
 
@@ -62,6 +58,10 @@ LINK_COUNTS = ("sent", "delivered", "lost", "duplicated", "reordered")
 SERVO_TIMEOUT_MARGIN = 5
 """The plant's servo time-out is d_max, of gains or witness, and this many samples, unless a scenario says otherwise."""
 
+MAX_START_UP_NS = 30 * NS_PER_S
+"""Link time that passes before sample k = 0, at the most: a flight that has not begun by then never does."""
+
+T = TypeVar("T")
 _Word = TypeVar("_Word", bound=str)
 
 
@@ -304,6 +304,7 @@ def _parse(table: Table, name: str, gains_name: str | None, plant_name: str | No
     witness = None if witness_name is None else read_witness(witness_name)
     if witness is not None:
         check_flyable(witness, str(witness_name), latch, plant)
+    duration_s = table.number("duration_s", above=0.0, high=86_400.0)
     longest = gains.d_max if witness is None else max(gains.d_max, witness.d_max)
     clocks = table.table("clocks", default=None)
     variants = table.table("variant", default=None)
@@ -314,7 +315,7 @@ def _parse(table: Table, name: str, gains_name: str | None, plant_name: str | No
         plant_name=plant_name,
         gains=gains,
         plant=plant,
-        duration_s=table.number("duration_s", above=0.0, high=86_400.0),
+        duration_s=duration_s,
         seed=table.integer("seed", default=1, low=0, high=MAX_SEED),
         reference=_reference(table),
         up=up,
@@ -335,8 +336,8 @@ def _parse(table: Table, name: str, gains_name: str | None, plant_name: str | No
         delta=_delta(table, plant),
         witness_name=witness_name,
         witness=witness,
-        rules=parse_rules(_texts(link, "rules"), "link.rules"),
-        changes=parse_changes(_texts(link, "changes"), "link.changes"),
+        rules=_link_texts(link, "rules", MAX_RULES, parse_rule),
+        changes=_link_texts(link, "changes", MAX_CHANGES, lambda text: _change(text, duration_s)),
         checks=tuple(
             _check(check, METRICS if witness is None else METRICS | WITNESS_METRICS, tuple(variants or ()))
             for check in table.tables("check", default=())
@@ -400,9 +401,46 @@ def _delta(table: Table, plant: Model) -> SquareDelta | None:
     return SquareDelta(delta.number("amplitude", default=0.15), delta.integer("half_period", default=20, low=1))
 
 
-def _texts(link: Table | None, key: str) -> Sequence[str]:
-    """Return a list of ``[link]``, empty without the key."""
-    return () if link is None else link.strings(key, default=())
+def _link_texts(link: Table | None, key: str, most: int, parse: Callable[[str], T]) -> tuple[T, ...]:
+    """Return what the texts of a key of ``[link]`` say, at most so many; a complaint names file, key and place."""
+    if link is None:
+        return ()
+    texts: Sequence[str] = link.strings(key, default=())
+    if len(texts) > most:
+        raise link.error(key, f"at most {most}", str(len(texts)))
+    said = []
+    for n, text in enumerate(texts):
+        try:
+            said.append(parse(text))
+        except InputError as error:
+            raise InputError(f"{link.source}: {link.name(key)}[{n}]: {error}") from None
+    return tuple(said)
+
+
+def _change(text: str, duration_s: float) -> Change:
+    """Return a change of the link in a flight of this length."""
+    change = parse_change(text)
+    check_changes((change,), duration_s)
+    return change
+
+
+def check_changes(changes: Iterable[Change], duration_s: float) -> None:
+    """Refuse changes of the link that would never be made, as the flight is over by then.
+
+    Link time begins with the first packet, before sample k = 0, so a flight and its start-up are allowed for.
+
+    Raises
+    ------
+    InputError
+        For the first of them, in one line.
+    """
+    latest_ns = MAX_START_UP_NS + round(duration_s * NS_PER_S)
+    for change in changes:
+        if change.at_ns > latest_ns:
+            raise InputError(
+                f'change "{format_change(change)}": expected at most {format_time(latest_ns)}, which is a flight of'
+                f" {duration_s:g} s and its start, found {format_time(change.at_ns)}"
+            )
 
 
 def _faults(table: Table) -> list[Fault]:
@@ -439,40 +477,3 @@ def _variant(scenario: Scenario, table: Table) -> Scenario:
         servo_timeout=_servo_timeout(table, scenario.servo_timeout),
         checks=(),
     )
-
-
-def plant_arguments(scenario: Scenario) -> list[str]:
-    """Return the options with which ``sitl plant`` builds the scenario's plant."""
-    arguments = ["--plant", scenario.plant_name, "--latch", scenario.latch]
-    arguments += ["--servo-timeout", str(scenario.servo_timeout or 0)]
-    arguments += [] if scenario.aoa else ["--no-aoa"]
-    arguments += ["--clock", format_clock(scenario.clocks["plant"])]
-    if scenario.x0 is not None:
-        arguments += ["--x0", ",".join(repr(value) for value in scenario.x0.tolist())]
-    if scenario.gust is not None:
-        arguments += ["--gust", repr(scenario.gust.start_k * scenario.plant.Ts)]
-    if scenario.delta is not None:
-        arguments += ["--uncertainty", f"{scenario.delta.amplitude!r}:{scenario.delta.half_period}"]
-    if faults := aircraft_faults(scenario.faults):
-        arguments += ["--seed", str(scenario.seed)]
-        arguments += [word for fault in faults for word in ("--fault", format_fault(fault))]
-    return arguments
-
-
-def relay_arguments(scenario: Scenario) -> list[str]:
-    """Return the options with which ``sitl relay`` builds the scenario's link."""
-    arguments = ["--up", format_spec(scenario.up), "--down", format_spec(scenario.down)]
-    if scenario.witness_name is not None:
-        arguments += ["--witness", scenario.witness_name]
-    arguments += [word for rule in scenario.rules for word in ("--rule", format_rule(rule))]
-    arguments += [word for change in scenario.changes for word in ("--at", format_change(change))]
-    return [*arguments, "--seed", str(scenario.seed), "--clock", format_clock(scenario.clocks["relay"])]
-
-
-def autopilot_arguments(scenario: Scenario) -> list[str]:
-    """Return the options with which ``autopilot`` builds the scenario's autopilot."""
-    arguments = ["--gains", scenario.gains_name, "--actuator", scenario.actuator]
-    arguments += ["--failsafe", scenario.failsafe, "--alpha", scenario.alpha]
-    arguments += [] if scenario.align else ["--no-align"]
-    arguments += ["--clock", format_clock(scenario.clocks["autopilot"])]
-    return [*arguments, "--reference", scenario.reference] if scenario.reference else arguments

@@ -19,7 +19,7 @@ from autopilot.profile import parse_profile
 from gains.command import NEGATIVE, SUCCESS, FiniteRange, print_json
 from gains.table import InputError
 from sitl.commands.links import link_options
-from sitl.commands.options import FILE, SEED
+from sitl.commands.options import CONTROL, FILE, SEED
 from sitl.faults import parse_fault
 from sitl.fly import FlightOptions, Outcome, fly
 from sitl.link.changes import format_change
@@ -30,7 +30,7 @@ from sitl.link.rules import format_rule
 from sitl.link.spec import parse_spec
 from sitl.processes import FlightFailed
 from sitl.programs import DEFAULT_PORT_BASE
-from sitl.scenario import Scenario, load_scenario, stored_scenarios
+from sitl.scenario import Scenario, check_changes, load_scenario, stored_scenarios
 from sitl.summary import summary_table
 
 __all__ = ["fly_command", "scenarios"]
@@ -64,10 +64,12 @@ def _report(path: Path | None, name: str, start_ns: int, came_to: Outcome | str)
 @click.option("--gains", "gains_name", help="Other gains than the scenario's.")
 @link_options
 @click.option("--rule", "rules", multiple=True,
-              help="Another link for some messages, as in up:ATTITUDE:delay=40ms; may be repeated.")  # fmt: skip
+              help="Another link for some messages, as in up:ATTITUDE:delay=40ms; may be repeated"
+                   " (docs/links.md).")  # fmt: skip
 @click.option("--at", "changes_at", multiple=True,
-              help="A change more of the link in flight, as in 3s:up:loss=0.5; may be repeated.")  # fmt: skip
-@click.option("--control", type=ADDRESS, is_flag=False, flag_value=DEFAULT_CONTROL, metavar="[ADDRESS]",
+              help="A change more of the link in flight, as in 3s:up:loss=0.5; may be repeated"
+                   " (docs/links.md).")  # fmt: skip
+@click.option("--control", type=CONTROL, is_flag=False, flag_value=DEFAULT_CONTROL, metavar="[[HOST:]PORT]",
               help=f'Let "sitl relay set" change the link in flight, at {DEFAULT_CONTROL} or elsewhere.')  # fmt: skip
 @click.option("--seed", type=SEED, help="Of everything random.")
 @click.option("--duration", type=FiniteRange(0.0, 86_400.0, min_open=True), help="Seconds.")
@@ -83,7 +85,12 @@ def _report(path: Path | None, name: str, start_ns: int, came_to: Outcome | str)
 @click.option("--wait-arm", is_flag=True, help="Leave arming to a ground station; else the vehicle arms itself.")
 @click.option("--key", "key_file", type=FILE, help="Sign the control link with the key in this file.")
 @click.option("--gcs-key", "gcs_key_file", type=FILE, help="Sign the ground stations' links with this key.")
-@click.option("--fault", "faults", multiple=True, help="A fault more, as in kill:autopilot@5s+0.5s; may be repeated.")
+@click.option(
+    "--fault",
+    "faults",
+    multiple=True,
+    help="A fault more, as in kill:autopilot@5s+0.5s; may be repeated (docs/faults.md).",
+)
 @click.option("--port-base", type=click.IntRange(0, 65_000), default=DEFAULT_PORT_BASE, show_default=True,
               help="The plant's port, the relay's is the next; 0 for any free ones.")  # fmt: skip
 @click.option("--json", "as_json", is_flag=True, help="Print the summary as one JSON object.")
@@ -116,13 +123,13 @@ def fly_command(
     scenario = load_scenario(scenario_name, gains=gains_name, plant=plant_name)
     scenario = _changed(scenario, preset, up, down, changes)
     stations = tuple(address for address in gcs if address != "none")
-    for address in stations:
-        dial("gcs", ADDRESS.convert(address, None, None)).socket.close()  # refused now rather than by a program
     if virtual and (wait_arm or key_file or gcs_key_file or alternatives or parameters_file):
         options = "--wait-arm, --key, --gcs-key, --alternative, --parameters"
         raise InputError(f"--virtual: expected none of {options}: there is no ground station in virtual time")
     if virtual and control is not None:
         raise InputError("--control: expected none with --virtual, which is over before anybody could ask: see --at")
+    for address in stations:
+        dial("gcs", ADDRESS.convert(address, None, None)).socket.close()  # refused now rather than by a program
     for path in filter(None, (key_file, gcs_key_file)):
         read_key(path)  # refused now rather than by a program
     folder = out or _new_folder(f"{scenario.name}-{datetime.now():%Y%m%d-%H%M%S}")
@@ -175,6 +182,7 @@ def _changed(
         parse_profile(given["reference"], scenario.gains.model.Ts)  # refused now rather than by a program
     if "duration" in given:
         given["duration_s"] = given.pop("duration")
+    check_changes(changes_at, given.get("duration_s", scenario.duration_s))
     if preset is not None:
         given["up"], given["down"] = parse_link(preset, None, None)
     given |= {way: parse_spec(text) for way, text in (("up", up), ("down", down)) if text is not None}

@@ -13,7 +13,7 @@ __all__ = ["link_options", "links"]
 
 _LINK_OPTIONS = (
     click.option("--link", "preset", type=click.Choice(sorted(PRESETS)), help="A link for both directions."),
-    click.option("--up", help="Plant to autopilot: delay=25ms,jitter=uniform:28ms,loss=0.1,... (README)."),
+    click.option("--up", help="Plant to autopilot: delay=25ms,jitter=uniform:28ms,loss=0.1,... (docs/links.md)."),
     click.option("--down", help="Autopilot to plant, likewise."),
 )
 

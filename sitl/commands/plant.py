@@ -81,7 +81,9 @@ def _plant_faults(texts: Sequence[str], states: Sequence[str]) -> tuple[Aircraft
 @click.option("--gust", "gust_s", type=FiniteRange(0.0), help="The gust of Eq. (52), from this time in s on.")
 @click.option("--uncertainty", help="Delta(k) of Eq. (51) as AMPLITUDE:HALF_PERIOD, for example 0.15:20.")
 @click.option("--no-aoa", is_flag=True, help="Send no AOA_SSA, as many vehicles do not.")
-@click.option("--fault", "fault_texts", multiple=True, help="Failing sensor or elevator; may be repeated (README).")
+@click.option(
+    "--fault", "fault_texts", multiple=True, help="Failing sensor or elevator; may be repeated (docs/faults.md)."
+)
 @click.option("--seed", type=SEED, default=1, show_default=True, help="Of a failing sensor's noise.")
 @click.option("--key", "key_file", type=FILE, help="Sign the link with the key in this file (README, Security).")
 @click.option("--accept-unsigned", is_flag=True, help="With --key: hear frames without signature, too.")

@@ -82,7 +82,7 @@ def _parse_spin(text: str) -> int:
               help="Another SPEC for some messages: up:ATTITUDE+AOA_SSA:delay=40ms; may be repeated.")  # fmt: skip
 @click.option("--at", "change_texts", multiple=True,
               help="Another SPEC from a link time on, as in 3s:up:loss=0.5; may be repeated.")  # fmt: skip
-@click.option("--config", type=FILE, help="The links, one or several, from this TOML file (README).")
+@click.option("--config", type=FILE, help="The links, one or several, from this TOML file (docs/links.md).")
 @click.option("--control", type=ADDRESS, is_flag=False, flag_value=DEFAULT_CONTROL, metavar="[ADDRESS]",
               help=f"Take requests of this machine's programs, at {DEFAULT_CONTROL} or another address.")  # fmt: skip
 @click.option("--spin", "spin_ns", type=Parsed("TIME", _parse_spin), default=format_time(DEFAULT_SPIN_NS),

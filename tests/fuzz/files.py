@@ -31,9 +31,10 @@ from gains.store import parse_law, parse_model
 from gains.table import InputError, Table
 from gains.verify import verified
 from gains.witnessfile import read_witness, write_witness
+from sitl.arguments import autopilot_arguments, plant_arguments, relay_arguments
 from sitl.link.tracefiles import MAX_DELAY_NS, load_table, load_trace
 from sitl.rescue import recover
-from sitl.scenario import autopilot_arguments, load_scenario, plant_arguments, relay_arguments
+from sitl.scenario import load_scenario
 from tests.fuzz.refusing import refusing
 from tests.fuzz.texts import TS, check_source
 from tests.helpers import HIRM

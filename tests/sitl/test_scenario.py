@@ -10,8 +10,9 @@ from click.testing import CliRunner
 from gains.table import InputError
 from gains.witnessfile import Witness, read_witness, write_witness
 from sitl.__main__ import cli
+from sitl.arguments import autopilot_arguments, plant_arguments, relay_arguments
 from sitl.faults import format_fault, parse_fault
-from sitl.scenario import Scenario, autopilot_arguments, load_scenario, plant_arguments, relay_arguments
+from sitl.scenario import Scenario, load_scenario
 
 FIFO = Witness("hirm-paper", "hirm", 0.025, 1, 3, "fifo", 1.01, (1, 2, 3))
 ANY = Witness("hirm-paper", "hirm", 0.025, 1, 3, "any", 1.01, (1, 3))
