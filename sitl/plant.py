@@ -54,6 +54,8 @@ DIVERGED = 1e6
 """A state beyond this is a crash: the aircraft stays where it is."""
 DEFAULT_SERVO_TIMEOUT = 9
 """Samples; d_max + 5 for the published gains."""
+SILENCE = 9
+"""So many samples without a new command, and each is numbered: the autopilot may have to start again."""
 
 
 class Refusal(StrEnum):
@@ -332,7 +334,8 @@ class PlantNode:
         """Send the sample's messages: its number while that is news, the delay, the state."""
         ms = t_ns // NS_PER_MS
         per_second = max(1, round(1.0 / self.model.Ts))
-        if d is None or flight.k % per_second == 0:
+        silent = d is None or flight.k - flight.latch.since_k >= SILENCE
+        if silent or flight.k % per_second == 0:
             self._send(NamedValueInt(ms, "SAMPLE_K", flight.k))
         if d is not None:
             self._send(NamedValueInt(ms, "DELAY_K", d))

@@ -17,7 +17,7 @@ from sitl.scenario import Scenario, load_scenario, stored_scenarios
 STORED = [name for name in stored_scenarios() if name.startswith("fault-")]
 S = 1_000_000_000
 NOMINAL = load_scenario("nominal")
-PROMPT_S = {"fault-kill-relay": 0.3, "fault-kill-plant": 0.9, "fault-kill-autopilot": 1.05, "fault-corrupt-gains": 1.05}
+PROMPT_S = {"fault-kill-relay": 0.3, "fault-kill-plant": 0.9, "fault-kill-autopilot": 0.4, "fault-corrupt-gains": 0.4}
 """What recovery takes where a program starts at once, as it does in virtual time; the scenarios leave it time to."""
 
 

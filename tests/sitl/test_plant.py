@@ -26,7 +26,7 @@ from gains.model import Actuator, Trim
 from gains.store import load_model
 from sitl.aircraft.disturbance import HarmonicGust, SquareDelta
 from sitl.faults import parse_fault
-from sitl.plant import DIVERGED, MAX_CATCH_UP, MAX_COMMANDS, PlantConfig, PlantNode, Refusal
+from sitl.plant import DIVERGED, MAX_CATCH_UP, MAX_COMMANDS, SILENCE, PlantConfig, PlantNode, Refusal
 from tests.helpers import HEARTBEAT, HIRM, MS, TS, S, broken, parse
 
 quick = settings(deadline=None)
@@ -459,13 +459,32 @@ def test_the_delay_is_reported_as_the_plant_saw_it():
     ]
 
 
+def numbered(b: Bench) -> list[int]:
+    """Return the samples that were sent with their number, each with the stamp of its instant."""
+    numbers = [(m.time_boot_ms, m.value) for m in b.named("SAMPLE_K")]
+    assert [stamp for stamp, _ in numbers] == [(T0 + k * TS) // MS for _, k in numbers]
+    return [k for _, k in numbers]
+
+
 def test_the_number_is_sent_with_every_sample_until_a_command_and_then_every_second():
     b = bench(servo_timeout=None)
     b.samples(0, 4)
+    for k in range(5, 201):
+        b.command(k - 1, 0.0, T0 + (k - 1) * TS + 1)
+        b.tick(T0 + k * TS)
+    assert numbered(b) == [*range(5), 40, 80, 120, 160, 200]
+
+
+@pytest.mark.parametrize("servo_timeout", [None, 5])
+def test_an_autopilot_that_starts_again_need_not_wait_a_second_for_the_number(servo_timeout: int | None):
+    b = bench(servo_timeout=servo_timeout)
+    b.samples(0, 4)
     b.command(4, 0.0, T0 + 4 * TS + 1)
-    b.samples(5, 200)
-    numbers = [(m.time_boot_ms, m.value) for m in b.named("SAMPLE_K")]
-    assert numbers == [((T0 + k * TS) // MS, k) for k in [*range(5), 40, 80, 120, 160, 200]]
+    b.samples(5, 20)
+    assert numbered(b) == [*range(5), *range(5 + SILENCE, 21)]
+    b.command(20, 0.0, T0 + 20 * TS + 1)
+    b.samples(21, 21 + SILENCE - 1)
+    assert numbered(b)[-1] == 20
 
 
 def test_a_plant_without_aoa_ssa_sends_all_else_as_with_it():
