@@ -16,11 +16,16 @@ __all__ = ["main"]
 
 COMMANDS = {
     "fly": "sitl.commands.fly:fly_command",
+    "linearize": "sitl.commands.linearize:linearize",
     "links": "sitl.commands.links:links",
+    "live": "sitl.commands.live:live",
     "plant": "sitl.commands.plant:plant",
     "recover": "sitl.commands.recover:recover_command",
     "relay": "sitl.commands.relay:relay",
+    "report": "sitl.commands.report:report",
+    "reproduce": "sitl.commands.reproduce:reproduce",
     "scenarios": "sitl.commands.fly:scenarios",
+    "teach": "sitl.commands.teach:teach",
 }
 """Subcommands, and where they are."""
 

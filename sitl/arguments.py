@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 from autopilot.link.process import format_clock
+from gains.store import model_path
+from sitl.aircraft.plants import is_nonlinear
+from sitl.aircraft.wind import format_wind
 from sitl.faults import aircraft_faults, format_fault
 from sitl.link.changes import format_change
 from sitl.link.rules import format_rule
@@ -18,13 +21,18 @@ def plant_arguments(scenario: Scenario) -> list[str]:
     arguments += ["--servo-timeout", str(scenario.servo_timeout or 0)]
     arguments += [] if scenario.aoa else ["--no-aoa"]
     arguments += ["--clock", format_clock(scenario.clocks["plant"])]
+    if is_nonlinear(scenario.plant_name):
+        arguments += ["--model", str(model_path(scenario.gains_name))]
+    if scenario.wind is not None:
+        arguments += ["--wind", format_wind(scenario.wind)]
     if scenario.x0 is not None:
         arguments += ["--x0", ",".join(repr(value) for value in scenario.x0.tolist())]
     if scenario.gust is not None:
         arguments += ["--gust", repr(scenario.gust.start_k * scenario.plant.Ts)]
     if scenario.delta is not None:
         arguments += ["--uncertainty", f"{scenario.delta.amplitude!r}:{scenario.delta.half_period}"]
-    if faults := aircraft_faults(scenario.faults):
+    faults = aircraft_faults(scenario.faults)
+    if faults or scenario.wind is not None:
         arguments += ["--seed", str(scenario.seed)]
         arguments += [word for fault in faults for word in ("--fault", format_fault(fault))]
     return arguments

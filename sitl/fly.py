@@ -20,6 +20,7 @@ from autopilot.link.clock import NS_PER_MS, NS_PER_S, NS_PER_US
 from autopilot.link.node import Record
 from autopilot.link.udp import true_ns
 from gains.command import version
+from sitl.aircraft.wind import format_wind
 from sitl.faults import DiskFull, Fault
 from sitl.flight import fly_virtual
 from sitl.flightdata import FlightData
@@ -103,6 +104,7 @@ def _metadata(scenario: Scenario, options: FlightOptions) -> dict[str, str]:
         "Ts": repr(scenario.plant.Ts),
         "actuator": scenario.actuator,
         "reference": scenario.reference,
+        **({"wind": format_wind(scenario.wind)} if scenario.wind is not None else {}),
         "up": format_spec(scenario.up),
         "down": format_spec(scenario.down),
         **({"rules": shlex.join(map(format_rule, scenario.rules))} if scenario.rules else {}),

@@ -16,7 +16,7 @@ from pathlib import Path
 from junitparser import Error, Failure, JUnitXml, TestCase, TestSuite
 
 from gains.table import InputError
-from sitl.scenario import Check
+from sitl.checks import Check
 from sitl.summary import Verdict
 
 __all__ = ["write_junit"]

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from typing import Literal
@@ -38,9 +39,10 @@ from autopilot.link.wire import (
     plant_heartbeat,
 )
 from gains.model import Model
+from sitl.aircraft.airframe import Airframe, Pose
 from sitl.aircraft.disturbance import HarmonicGust, SquareDelta
 from sitl.aircraft.faulty import FaultyElevator, FaultySensors
-from sitl.aircraft.linear import LinearAircraft
+from sitl.aircraft.linear import LinearAirframe
 from sitl.faults import AircraftFault
 
 __all__ = ["PlantConfig", "PlantNode", "Refusal"]
@@ -50,8 +52,6 @@ MAX_COMMANDS = 256
 """Commands that may wait for the next sample; further ones are refused."""
 MAX_CATCH_UP = 64
 """Samples that one wake-up may work off; the next follow at once, after the port has been served."""
-DIVERGED = 1e6
-"""A state beyond this is a crash: the aircraft stays where it is."""
 DEFAULT_SERVO_TIMEOUT = 9
 """Samples; d_max + 5 for the published gains."""
 SILENCE = 9
@@ -95,6 +95,8 @@ class PlantConfig:
         What its sensors and its elevator do wrong, times from sample k = 0.
     seed : int
         Of the sensors' noise.
+    airframe : callable or None
+        Makes the aircraft, at trim; None is the linear one of ``model``. With one ``x0`` is of no meaning.
     """
 
     model: Model
@@ -106,6 +108,7 @@ class PlantConfig:
     aoa: bool = True
     faults: tuple[AircraftFault, ...] = ()
     seed: int = 1
+    airframe: Callable[[], Airframe] | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,9 +136,7 @@ class _Flight:
 
     t0_ns: int
     k: int
-    x: NDArray[np.float64]
     position: NDArray[np.float64]
-    altitude_m: float
     latch: _Latch
     pending: list[_Command] = field(default_factory=list)
     crashed: bool = False
@@ -165,11 +166,14 @@ class PlantNode:
         self._Ts_ns = config.model.Ts_ns
         self._still = np.zeros(config.model.nw)
         self.travel = travel_of(config.model)
-        self.aircraft = LinearAircraft(config.model)
+        nonlinear = config.airframe is not None
+        self.airframe = config.airframe() if config.airframe is not None else LinearAirframe(config.model, config.x0)
         self.wire = Wire(PLANT, AUTOPILOT, seal=seal)
         self.refusals: Counter[Refusal] = Counter()
         self._gust = replace(config.gust) if config.gust is not None else None
         self._sensors = sensors_of(config.model)
+        self._air_data = config.aoa and (nonlinear or any(sensor.message is AoaSsa for sensor in self._sensors))
+        self._tells_air = nonlinear
         self._faulty_sensors = FaultySensors(config.model, config.faults, config.seed)
         self._elevator = FaultyElevator(config.model, config.faults)
         self._flight: _Flight | None = None
@@ -244,14 +248,10 @@ class PlantNode:
     def _start(self, now_ns: int) -> None:
         """Begin the clockwork at the next instant of the grid."""
         Ts_ns = self._Ts_ns
-        x0 = self.model.trim.x if self.config.x0 is None else self.config.x0
-        condition = self.model.condition
         self._flight = _Flight(
             t0_ns=-(-now_ns // Ts_ns) * Ts_ns,
             k=0,
-            x=np.array(x0, dtype=np.float64),
             position=np.array(self.model.trim.u),
-            altitude_m=condition.altitude_m if condition is not None else 0.0,
             latch=_Latch(u=self.travel.neutral),
         )
         self._event("clockwork", "first heartbeat: the clockwork starts", now_ns)
@@ -303,11 +303,12 @@ class PlantNode:
         w = self._gust.w(k) if self._gust is not None else self._still
         delta = self.config.delta.delta(k) if self.config.delta is not None else 0.0
         d = None if latch.j is None else k - latch.j
+        x, pose = self.airframe.x, self.airframe.pose
         body = {
             "k": k,
             "t_ns": t_ns,
             "late_ns": now_ns - t_ns,
-            "x": flight.x.tolist(),
+            "x": x.tolist(),
             "u": flight.position.tolist(),
             "j": latch.j,
             "d": d,
@@ -315,22 +316,16 @@ class PlantNode:
             "delta": delta,
             "timeout": latch.timed_out,
         }
+        if self._tells_air:
+            body["air"] = {name: getattr(pose, name) for name in _AIR}
         self._records.append(Record("plant/truth", now_ns, body))
-        self._sense(flight, t_ns, d)
-        self._integrate(flight, w, delta, now_ns)
+        self._sense(flight, x, pose, t_ns, d)
+        if not flight.crashed and (reason := self.airframe.advance(flight.position, w, delta)) is not None:
+            flight.crashed = True
+            self._event("diverged", f"{reason} at sample {k + 1}", now_ns)
         flight.k += 1
 
-    def _integrate(self, flight: _Flight, w: NDArray[np.float64], delta: float, now_ns: int) -> None:
-        if flight.crashed:
-            return
-        following = self.aircraft.step(flight.x, flight.position, w, delta)
-        if not all(-DIVERGED < value < DIVERGED for value in following.tolist()):
-            flight.crashed = True
-            self._event("diverged", f"state beyond {DIVERGED:g} at sample {flight.k + 1}", now_ns)
-            return
-        flight.x = following
-
-    def _sense(self, flight: _Flight, t_ns: int, d: int | None) -> None:
+    def _sense(self, flight: _Flight, x: NDArray[np.float64], pose: Pose, t_ns: int, d: int | None) -> None:
         """Send the sample's messages: its number while that is news, the delay, the state."""
         ms = t_ns // NS_PER_MS
         per_second = max(1, round(1.0 / self.model.Ts))
@@ -339,25 +334,17 @@ class PlantNode:
             self._send(NamedValueInt(ms, "SAMPLE_K", flight.k))
         if d is not None:
             self._send(NamedValueInt(ms, "DELAY_K", d))
-        sensed = self._faulty_sensors.sense(flight.k, flight.x)
-        attitude, air = self._fields(sensed)
+        attitude = {"roll": pose.roll_rad, "pitch": pose.pitch_rad, "yaw": pose.yaw_rad}
+        attitude |= {"rollspeed": pose.p_rad_s, "pitchspeed": pose.q_rad_s, "yawspeed": pose.r_rad_s}
+        air = {"AOA": math.degrees(pose.alpha_rad), "SSA": math.degrees(pose.beta_rad)}
+        sensed = self._faulty_sensors.sense(flight.k, x).tolist()
+        for sensor, value in zip(self._sensors, sensed, strict=True):  # the states of the model may be sensed wrong
+            fields = attitude if sensor.message is Attitude else air
+            fields[sensor.field] = value * sensor.to_field
         self._send(Attitude(time_boot_ms=ms, **attitude))
-        if air is not None and self.config.aoa:
-            self._send(AoaSsa(t_ns // NS_PER_US, air.get("AOA", 0.0), air.get("SSA", 0.0)))
-        if sensed is not flight.x:
-            attitude, air = self._fields(flight.x)  # the air data system is another sensor, without faults
-        condition = self.model.condition
-        speed = condition.airspeed_m_s if condition is not None else 0.0
-        climb = speed * math.sin(attitude["pitch"] - math.radians(air.get("AOA", 0.0) if air else 0.0))
-        self._send(VfrHud(speed, speed, 0, 0, flight.altitude_m, climb))
-        flight.altitude_m += climb * self.model.Ts
-
-    def _fields(self, x: NDArray[np.float64]) -> tuple[dict[str, float], dict[str, float] | None]:
-        """Return the fields of ATTITUDE and, where the model has any, of AOA_SSA that a state fills."""
-        fields: dict[type, dict[str, float]] = {Attitude: dict.fromkeys(_ATTITUDE_FIELDS, 0.0)}
-        for sensor, value in zip(self._sensors, x.tolist(), strict=True):
-            fields.setdefault(sensor.message, {})[sensor.field] = value * sensor.to_field
-        return fields[Attitude], fields.get(AoaSsa)
+        if self._air_data:
+            self._send(AoaSsa(t_ns // NS_PER_US, **air))
+        self._send(_hud(pose))  # the air data system is another sensor, without faults
 
     def _send(self, message: Message) -> None:
         self._out.append((PORT, self.wire.encode(message)))
@@ -372,4 +359,12 @@ class PlantNode:
         self._records.append(Record("events", now_ns, body))
 
 
-_ATTITUDE_FIELDS = ("roll", "pitch", "yaw", "rollspeed", "pitchspeed", "yawspeed")
+_AIR = ("airspeed_m_s", "altitude_m", "climb_m_s", "roll_rad", "beta_rad", "throttle")
+"""What else of an aircraft of more than the model's states is recorded."""
+
+
+def _hud(pose: Pose) -> VfrHud:
+    """Return VFR_HUD of a pose."""
+    heading = round(math.degrees(pose.yaw_rad)) % 360
+    throttle = round(100.0 * pose.throttle)
+    return VfrHud(pose.airspeed_m_s, pose.groundspeed_m_s, heading, throttle, pose.altitude_m, pose.climb_m_s)

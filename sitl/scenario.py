@@ -6,7 +6,6 @@ from a scenario, for either driver, and writes the command lines that build the 
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from importlib import resources
@@ -19,15 +18,18 @@ from numpy.typing import NDArray
 from autopilot.alpha import AlphaChoice
 from autopilot.app import AutopilotNode
 from autopilot.config import AutopilotConfig
-from autopilot.failsafe import Mode
 from autopilot.link.clock import NS_PER_S, Clock
 from autopilot.link.process import parse_clock
 from autopilot.profile import parse_profile
 from gains.model import GainLaw, Model
-from gains.store import load_law, load_model
+from gains.store import load_law
 from gains.table import InputError, Table
 from gains.witnessfile import Witness, read_witness
+from sitl.aircraft.airframe import Airframe
 from sitl.aircraft.disturbance import HarmonicGust, SquareDelta
+from sitl.aircraft.plants import airframe_maker, is_nonlinear, plant_model
+from sitl.aircraft.wind import WindSpec, parse_wind
+from sitl.checks import METRICS, WITNESS_METRICS, Check, read_check
 from sitl.faults import Fault, aircraft_faults, check_faults, parse_fault
 from sitl.link.changes import MAX_CHANGES, Change, format_change, format_time, parse_change
 from sitl.link.gate import Gate, check_flyable
@@ -39,7 +41,6 @@ from sitl.plant import PlantConfig, PlantNode
 from sitl.seeds import MAX_SEED
 
 __all__ = [
-    "Check",
     "Scenario",
     "check_changes",
     "load_scenario",
@@ -53,8 +54,6 @@ DEFAULT_CLOCKS: Mapping[str, str] = {
 }
 """No two clocks agree unless a scenario says so: mixed-up clocks fail at once."""
 
-LINK_COUNTS = ("sent", "delivered", "lost", "duplicated", "reordered")
-
 SERVO_TIMEOUT_MARGIN = 5
 """The plant's servo time-out is d_max, of gains or witness, and this many samples, unless a scenario says otherwise."""
 
@@ -63,62 +62,6 @@ MAX_START_UP_NS = 30 * NS_PER_S
 
 T = TypeVar("T")
 _Word = TypeVar("_Word", bound=str)
-
-
-METRICS = frozenset(
-    {
-        "duration_s",
-        "samples",
-        "released_s",
-        "rms_error_rad",
-        "max_error_rad",
-        "final_error_rad",
-        "max_output_rad",
-        "delay.estimated_exact_fraction",
-        "delay.within_one_fraction",
-        "delay.covered_fraction",
-        "delay.unknown_fraction",
-        *(f"link.{way}.{n}" for way in ("up", "down") for n in LINK_COUNTS),
-        "failsafe_events",
-        "failsafe_reaction_samples",
-        "mode_at_end",
-        *(f"mode_s.{mode}" for mode in Mode),
-        "longest_saturation_s",
-        "reentry_saturation_s",
-        "late_ticks",
-        "recovery_s",
-    }
-)
-"""What of a summary a check may judge; of a variant's too, after ``variants.NAME.``."""
-
-WITNESS_METRICS = frozenset(
-    f"witness.{name}"
-    for name in ("predicted", "growth_per_sample", "growth_error", "mismatches", "mismatch_fraction", "gated")
-)
-"""And these, where the link replays a witness."""
-
-
-@dataclass(frozen=True, slots=True)
-class Check:
-    """A bound on a number of the summary, or a text that it must be.
-
-    Attributes
-    ----------
-    name : str
-        What is claimed.
-    metric : str
-        Dotted path into the summary, for example ``delay.within_one_fraction``.
-    at_most, at_least : float or None
-        Inclusive bounds.
-    equals : str or None
-        The text that is wanted.
-    """
-
-    name: str
-    metric: str
-    at_most: float | None = None
-    at_least: float | None = None
-    equals: str | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -130,11 +73,11 @@ class Scenario:
     name, title : str
         Short and long name.
     gains_name, plant_name : str
-        What the gains and the plant were loaded from: stored names or paths.
+        What the gains and the plant were loaded from: stored names or paths, or the name of a nonlinear aircraft.
     gains : Gains or Schedule
         What flies, on the model it was designed for.
     plant : Model
-        What is flown, as a rule that same model.
+        What is flown, as a rule that same model; a nonlinear aircraft is described by it.
     duration_s : float
         Length from k = 0.
     seed : int
@@ -159,6 +102,8 @@ class Scenario:
         Eq. (52).
     delta : SquareDelta or None
         Eq. (51).
+    wind : WindSpec or None
+        Turbulence and gusts of a nonlinear aircraft.
     witness_name : str or None
         File of the delay sequence that the link imposes.
     witness : Witness or None
@@ -197,6 +142,7 @@ class Scenario:
     x0: NDArray[np.float64] | None = None
     gust: HarmonicGust | None = None
     delta: SquareDelta | None = None
+    wind: WindSpec | None = None
     witness_name: str | None = None
     witness: Witness | None = None
     faults: tuple[Fault, ...] = ()
@@ -235,8 +181,22 @@ class Scenario:
                 self.aoa,
                 aircraft_faults(self.faults),
                 self.seed,
+                self.airframe_maker(),
             )
         )
+
+    def airframe_maker(self) -> Callable[[], Airframe] | None:
+        """Return what makes the aircraft; None where it is the linear one.
+
+        Raises
+        ------
+        InputError
+            When the plant cannot fly what the scenario asks of it.
+        """
+        if is_nonlinear(self.plant_name) and (self.x0 is not None or self.delta is not None):
+            asked = "x0" if self.x0 is not None else "uncertainty"
+            raise InputError(f"{asked}: expected a linear model as plant, found {self.plant_name}")
+        return airframe_maker(self.plant_name, self.plant, self.wind, self.seed)
 
     def relay_node(self, *, log_rate: int = DEFAULT_LOG_RATE) -> RelayNode:
         """Return the relay, new, which records at most so many packets a second."""
@@ -295,7 +255,8 @@ def load_scenario(name_or_path: str, *, gains: str | None = None, plant: str | N
 def _parse(table: Table, name: str, gains_name: str | None, plant_name: str | None) -> Scenario:
     file_gains, file_plant = table.string("gains"), table.string("plant")
     gains_name, plant_name = gains_name or file_gains, plant_name or file_plant
-    gains, plant = load_law(gains_name), load_model(plant_name)
+    gains = load_law(gains_name)
+    plant = plant_model(plant_name, gains.model)
     _check_fit(gains, plant)
     link = table.table("link", default=None)
     up, down = parse_link(*((link.string(key, default=None) if link else None) for key in ("preset", "up", "down")))
@@ -334,16 +295,18 @@ def _parse(table: Table, name: str, gains_name: str | None, plant_name: str | No
         x0=table.vector("x0", length=plant.nx, default=None),
         gust=_gust(table, plant),
         delta=_delta(table, plant),
+        wind=_wind(table),
         witness_name=witness_name,
         witness=witness,
         rules=_link_texts(link, "rules", MAX_RULES, parse_rule),
         changes=_link_texts(link, "changes", MAX_CHANGES, lambda text: _change(text, duration_s)),
         checks=tuple(
-            _check(check, METRICS if witness is None else METRICS | WITNESS_METRICS, tuple(variants or ()))
+            read_check(check, METRICS if witness is None else METRICS | WITNESS_METRICS, tuple(variants or ()))
             for check in table.tables("check", default=())
         ),
     )
     parse_profile(scenario.reference, gains.model.Ts)
+    scenario.airframe_maker()
     scenario = scenario.with_faults(_faults(table))
     if variants is None:
         return scenario
@@ -401,6 +364,11 @@ def _delta(table: Table, plant: Model) -> SquareDelta | None:
     return SquareDelta(delta.number("amplitude", default=0.15), delta.integer("half_period", default=20, low=1))
 
 
+def _wind(table: Table) -> WindSpec | None:
+    text = table.string("wind", default=None)
+    return None if text is None else parse_wind(text)
+
+
 def _link_texts(link: Table | None, key: str, most: int, parse: Callable[[str], T]) -> tuple[T, ...]:
     """Return what the texts of a key of ``[link]`` say, at most so many; a complaint names file, key and place."""
     if link is None:
@@ -446,26 +414,6 @@ def check_changes(changes: Iterable[Change], duration_s: float) -> None:
 def _faults(table: Table) -> list[Fault]:
     """Return the faults of the file, none without the key."""
     return [parse_fault(text) for text in table.strings("faults", default=())]
-
-
-def _check(table: Table, metrics: frozenset[str], variants: tuple[str, ...]) -> Check:
-    """Return a check, its metric one that there will be."""
-    check = Check(
-        table.string("name"),
-        table.string("metric"),
-        table.number("at_most", default=None),
-        table.number("at_least", default=None),
-        table.string("equals", default=None),
-    )
-    if check.at_most is None and check.at_least is None and check.equals is None:
-        raise table.error("at_most", "at_most, at_least or equals", "none")
-    known = {*metrics, *(f"variants.{variant}.{metric}" for variant in variants for metric in metrics)}
-    if check.metric not in known:
-        near = difflib.get_close_matches(check.metric, known, 1)
-        raise table.error(
-            "metric", f"a number of the summary, such as {near[0] if near else 'rms_error_rad'}", check.metric
-        )
-    return check
 
 
 def _variant(scenario: Scenario, table: Table) -> Scenario:

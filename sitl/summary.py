@@ -15,10 +15,12 @@ from rich.text import Text
 from autopilot.failsafe import FLOWN_BY_FIRST_LAW, Mode
 from gains.model import GainLaw
 from gains.verify import verified
+from sitl.aircraft.plants import is_nonlinear
+from sitl.checks import LINK_COUNTS, Check
 from sitl.flightdata import FlightData
 from sitl.link.impairment import Fate
 from sitl.recovery import longest_recovery_s, recoveries
-from sitl.scenario import LINK_COUNTS, Check, Scenario
+from sitl.scenario import Scenario
 from sitl.witness import witness_summary
 
 __all__ = ["LATE_NS", "Verdict", "delay_summary", "judge", "link_summary", "summarise", "summary_table"]
@@ -74,7 +76,7 @@ def summarise(scenario: Scenario, kept: Sequence[Kept], flight: FlightData, *, v
         "scenario": scenario.name,
         "title": scenario.title,
         "gains": scenario.gains.name,
-        "plant": scenario.plant.name,
+        "plant": scenario.plant_name if is_nonlinear(scenario.plant_name) else scenario.plant.name,
         "seed": scenario.seed,
         "virtual": virtual,
         "certificate": _certificate(scenario.gains),
@@ -87,7 +89,7 @@ def summarise(scenario: Scenario, kept: Sequence[Kept], flight: FlightData, *, v
         "max_error_rad": float(error.max()),
         "final_error_rad": float(error[-last_second:].max()),
         "max_output_rad": float(np.abs(flight.output[:, 0]).max()),
-        "delay": delay_summary(flight),
+        "delay": {**delay_summary(flight), "outside_fraction": outside_fraction(flight, scenario.gains)},
         "link": link_summary(kept),
         "failsafe_events": len(leaving),
         "failsafe_reaction_samples": failsafe_reaction_samples(kept, scenario),
@@ -160,6 +162,12 @@ def delay_summary(flight: FlightData) -> dict[str, Any]:
         "covered_fraction": float(np.mean(covered)) if known.size else None,
         "unknown_fraction": float(np.mean(np.isnan(flight.forecast))) if flight.forecast.size else None,
     }
+
+
+def outside_fraction(flight: FlightData, gains: GainLaw) -> float | None:
+    """Return the fraction of the samples with a known true delay at which it lay outside the gains' window."""
+    true = flight.d[~np.isnan(flight.d)]
+    return float(np.mean((true < gains.d_min) | (true > gains.d_max))) if true.size else None
 
 
 def link_summary(kept: Iterable[Kept]) -> dict[str, dict[str, int]]:
@@ -276,7 +284,7 @@ def summary_table(summary: Mapping[str, Any], verdicts: Sequence[Verdict]) -> Gr
     released_s = summary.get("released_s", 0.0)
     released = f"; without {released_s:.3g} s disarmed or by hand" if released_s else ""
     grid.add_row("tracking error", f"rms {rms:.3g}°, largest {peak:.3g}°, last second {final:.3g}°{released}")
-    grid.add_row("true delay", _histogram_text(delay["true_histogram"]))
+    grid.add_row("true delay", _histogram_text(delay["true_histogram"]) + _outside_text(delay["outside_fraction"]))
     grid.add_row("forecast", _forecast_text(delay))
     for way, counts in summary["link"].items():
         grid.add_row(f"link {way}", "  ".join(f"{name} {n}" for name, n in counts.items()))
@@ -307,6 +315,10 @@ def _histogram_text(histogram: Mapping[str, int]) -> str:
         last = tail[-1][0] if len(tail) == 1 else f"{tail[0][0]}..{tail[-1][0]}"
         shown.append(f"d={last}: {sum(n for _, n in tail)}")
     return "  ".join(shown) or "no command arrived"
+
+
+def _outside_text(fraction: float | None) -> str:
+    return f"  ({fraction:.2%} outside the window)" if fraction else ""
 
 
 def _forecast_text(delay: Mapping[str, Any]) -> str:

@@ -97,6 +97,14 @@ SCHEMAS: Mapping[str, Mapping[str, Any]] = MappingProxyType(
             w=_vector("Disturbance (gust) at sample k, in the model's units."),
             delta=_field("number", "Uncertainty of the plant at sample k, no unit."),
             timeout=_field("boolean", "The servo time-out holds the control at neutral."),
+            optional={
+                "air": _field(
+                    "object",
+                    "What else moves, of an aircraft that is more than the model's states: SI units, rad, throttle 0 to 1.",
+                    properties={},
+                    additionalProperties={"type": "number"},
+                ),
+            },
         ),
         "autopilot/command": _schema(
             "Autopilot command",

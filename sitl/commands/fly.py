@@ -18,6 +18,7 @@ from autopilot.link.udp import Address, dial, true_ns
 from autopilot.profile import parse_profile
 from gains.command import NEGATIVE, SUCCESS, FiniteRange, print_json
 from gains.table import InputError
+from sitl.aircraft.wind import parse_wind
 from sitl.commands.links import link_options
 from sitl.commands.options import CONTROL, FILE, SEED
 from sitl.faults import parse_fault
@@ -60,7 +61,8 @@ def _report(path: Path | None, name: str, start_ns: int, came_to: Outcome | str)
 
 @click.command("fly")
 @click.argument("scenario_name", metavar="[SCENARIO]", default="nominal")
-@click.option("--plant", "plant_name", help="Another plant than the scenario's.")
+@click.option("--plant", "plant_name",
+              help="Another plant than the scenario's: a model, or sixdof:NAME or jsbsim:NAME.")  # fmt: skip
 @click.option("--gains", "gains_name", help="Other gains than the scenario's.")
 @link_options
 @click.option("--rule", "rules", multiple=True,
@@ -71,6 +73,7 @@ def _report(path: Path | None, name: str, start_ns: int, came_to: Outcome | str)
                    " (docs/links.md).")  # fmt: skip
 @click.option("--control", type=CONTROL, is_flag=False, flag_value=DEFAULT_CONTROL, metavar="[[HOST:]PORT]",
               help=f'Let "sitl relay set" change the link in flight, at {DEFAULT_CONTROL} or elsewhere.')  # fmt: skip
+@click.option("--wind", "wind_text", help="Turbulence and gusts, as in dryden:moderate+gust:5mps:100m@3s (README).")
 @click.option("--seed", type=SEED, help="Of everything random.")
 @click.option("--duration", type=FiniteRange(0.0, 86_400.0, min_open=True), help="Seconds.")
 @click.option("--virtual", is_flag=True, help="In virtual time: one process, no socket, much faster.")
@@ -178,6 +181,8 @@ def _changed(
     rules = parse_rules((*map(format_rule, scenario.rules), *rules), "--rule")
     changes_at = parse_changes((*map(format_change, scenario.changes), *changes_at), "--at")
     given = {name: value for name, value in changes.items() if value is not None}
+    if "wind_text" in given:
+        given["wind"] = parse_wind(given.pop("wind_text"))
     if "reference" in given:
         parse_profile(given["reference"], scenario.gains.model.Ts)  # refused now rather than by a program
     if "duration" in given:
@@ -191,7 +196,10 @@ def _changed(
         return replace(one, rules=rules, changes=changes_at, **given).with_faults((*one.faults, *faults))
 
     variants = {name: changed(variant) for name, variant in scenario.variants.items()}
-    return replace(changed(scenario), variants=variants)
+    scenario = replace(changed(scenario), variants=variants)
+    if make := scenario.airframe_maker():
+        make()  # refused now rather than by a program
+    return scenario
 
 
 @click.command()

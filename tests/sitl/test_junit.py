@@ -14,8 +14,8 @@ import sitl.__main__
 import sitl.scenario
 from gains.command import run
 from gains.table import InputError
+from sitl.checks import Check
 from sitl.junit import FLIGHT_CASE, MAX_PROPERTIES, write_junit
-from sitl.scenario import Check
 from sitl.summary import Verdict
 
 CHILDREN = {

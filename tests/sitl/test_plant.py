@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
+import jsonschema
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -24,9 +25,11 @@ from autopilot.link.wire import (
 )
 from gains.model import Actuator, Trim
 from gains.store import load_model
+from sitl.aircraft.airframe import Pose
 from sitl.aircraft.disturbance import HarmonicGust, SquareDelta
+from sitl.aircraft.linear import DIVERGED
 from sitl.faults import parse_fault
-from sitl.plant import DIVERGED, MAX_CATCH_UP, MAX_COMMANDS, SILENCE, PlantConfig, PlantNode, Refusal
+from sitl.plant import MAX_CATCH_UP, MAX_COMMANDS, SILENCE, PlantConfig, PlantNode, Refusal
 from tests.helpers import HEARTBEAT, HIRM, MS, TS, S, broken, parse
 
 quick = settings(deadline=None)
@@ -557,6 +560,60 @@ def test_a_crash_stops_the_aircraft_and_not_the_plant():
     assert np.all(x[-1] == x[-50])
     assert len(b.truth) > 390
     assert len(b.events("diverged")) == 1
+
+
+@dataclass
+class Puppet:
+    """An airframe moved by hand: one degree of roll and ten metres up per sample, and a wall at the fifth."""
+
+    x: np.ndarray = field(default_factory=lambda: np.array([0.05, 0.0, 0.07]))
+    pose: Pose = field(
+        default_factory=lambda: Pose(pitch_rad=0.07, alpha_rad=0.05, throttle=0.42, yaw_rad=-math.pi / 2)
+    )
+    moved: list = field(default_factory=list)
+
+    def advance(self, u, w, delta) -> str | None:
+        self.moved.append((u.tolist(), w.tolist()))
+        if len(self.moved) == 5:
+            return "a wall"
+        up = {"roll_rad": self.pose.roll_rad + math.radians(1.0), "altitude_m": self.pose.altitude_m + 10.0}
+        self.pose = self.pose._replace(**up, airspeed_m_s=80.0, climb_m_s=1.5, beta_rad=0.01, p_rad_s=0.3)
+        return None
+
+
+def test_an_airframe_says_all_of_its_pose_and_is_recorded_with_it():
+    b = bench(airframe=Puppet)
+    b.samples(0, 2)
+    attitude, air, hud = b.of("ATTITUDE")[2], b.of("AOA_SSA")[2], b.of("VFR_HUD")[2]
+    assert attitude.roll == pytest.approx(math.radians(2.0))
+    assert (attitude.rollspeed, attitude.pitch, attitude.yaw) == pytest.approx((0.3, 0.07, -math.pi / 2))
+    assert math.radians(air.AOA) == pytest.approx(0.05)
+    assert math.radians(air.SSA) == pytest.approx(0.01)
+    assert (hud.airspeed, hud.alt, hud.climb, hud.heading, hud.throttle) == (80.0, 20.0, 1.5, 270, 42)
+    assert b.truth[2]["air"]["altitude_m"] == 20.0
+    jsonschema.validate(b.truth[2], dict(SCHEMAS["plant/truth"]))
+
+
+def test_a_sensor_fault_of_an_airframe_changes_what_is_sent_and_not_the_pose():
+    b = bench(airframe=Puppet, faults=(parse_fault("sensor:theta_rad:bias:0.5@0s"),))
+    b.samples(0, 0)
+    assert b.of("ATTITUDE")[0].pitch == pytest.approx(0.57)
+    assert math.radians(b.of("AOA_SSA")[0].AOA) == pytest.approx(0.05)
+
+
+def test_an_airframe_that_cannot_fly_on_stays_where_it_is_and_says_why():
+    b = bench(airframe=Puppet)
+    b.samples(0, 9)
+    assert [e["text"] for e in b.events("diverged")] == ["a wall at sample 5"]
+    assert b.truth[9]["air"] == b.truth[4]["air"]
+    assert len(b.plant.airframe.moved) == 5
+
+
+def test_an_airframe_starts_where_it_is_at_each_start_of_the_plant():
+    config = PlantConfig(MODEL, airframe=Puppet)
+    first, second = PlantNode(config), PlantNode(config)
+    first.airframe.advance(np.zeros(1), np.zeros(1), 0.0)
+    assert second.airframe.pose.altitude_m == 0.0
 
 
 def test_records_keep_their_schema():

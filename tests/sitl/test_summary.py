@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import replace
 from io import StringIO
 from typing import Any
 
@@ -11,13 +12,15 @@ import pytest
 from rich.console import Console
 
 from gains.store import load_gains
+from sitl.checks import Check
 from sitl.faults import fault_changes, fault_record, parse_fault
 from sitl.flightdata import FlightData
 from sitl.recovery import Recovery, longest_recovery_s, recoveries
-from sitl.scenario import Check, load_scenario
-from sitl.summary import delay_summary, judge, summarise, summary_table
+from sitl.scenario import load_scenario
+from sitl.summary import delay_summary, judge, outside_fraction, summarise, summary_table
 
-MODEL = load_gains("hirm-paper").model
+HIRM = load_gains("hirm-paper")
+MODEL = HIRM.model
 TS, S = MODEL.Ts_ns, 1_000_000_000
 ZERO = 7 * S
 
@@ -148,6 +151,16 @@ def test_the_forecasts_of_two_starts_are_scored_each_by_its_own_delays() -> None
     scored = delay_summary(FlightData.from_records(entries, MODEL))
     assert scored["true_histogram"] == {"2": 96}
     assert scored["estimated_exact_fraction"] == pytest.approx(38 / 96)  # those of the first start were right
+
+
+def test_samples_outside_the_window_are_counted_of_those_whose_delay_is_known() -> None:
+    flight = FlightData.from_records(restarted(), MODEL)
+    known = np.count_nonzero(~np.isnan(flight.d))
+    narrow = replace(HIRM, d_min=1, d_max=1)
+    assert outside_fraction(flight, narrow) == 1.0
+    assert outside_fraction(flight, HIRM) == 0.0
+    one_late = replace(flight, d=np.where(np.arange(len(flight.d)) == 50, 5.0, flight.d))
+    assert outside_fraction(one_late, HIRM) == pytest.approx(1 / known)
 
 
 def test_the_summary_lists_the_faults_counts_the_dead_time_and_says_it_to_people() -> None:
