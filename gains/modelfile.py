@@ -1,0 +1,99 @@
+"""Writing model files: the other direction of :func:`gains.store.load_model`.
+
+Every number is written at full double precision, so what is read again is the same model, to the last bit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import tomli_w
+
+from gains.atomic import replace_file
+from gains.model import Actuator, Matrix, Model, Reference
+
+__all__ = ["Continuous", "model_text", "save_model"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Continuous:
+    """The plant before it is held at Ts: x'(t) = Ap x + Bp u + Ep w.
+
+    Attributes
+    ----------
+    Ap : ndarray, shape (nx, nx)
+    Bp : ndarray, shape (nx, nu)
+    Ep : ndarray, shape (nx, nw)
+    """
+
+    Ap: Matrix
+    Bp: Matrix
+    Ep: Matrix
+
+
+def save_model(path: str | Path, model: Model, *, plant: Continuous | None = None, notes: Iterable[str] = ()) -> None:
+    """Write a model file; a file of that name is replaced at once or not at all.
+
+    Parameters
+    ----------
+    path : str or Path
+    model : Model
+        What is written.
+    plant : Continuous, optional
+        Written instead of the model's A, B and E, which must be its exact hold.
+    notes : iterable of str
+        Lines of comment at the head of the file.
+
+    Raises
+    ------
+    InputError
+        When the file cannot be written.
+    """
+    replace_file(Path(path), model_text(model, plant=plant, notes=notes).encode())
+
+
+def model_text(model: Model, *, plant: Continuous | None = None, notes: Iterable[str] = ()) -> str:
+    """Return the text of a model file; parameters as of :func:`save_model`."""
+    head = "".join(f"# {line}".rstrip() + "\n" for note in notes for line in note.splitlines())
+    return head + ("\n" if head else "") + tomli_w.dumps(_content(model, plant))
+
+
+def _content(model: Model, plant: Continuous | None) -> dict[str, object]:
+    A, B, E = (model.A, model.B, model.E) if plant is None else (plant.Ap, plant.Bp, plant.Ep)
+    content: dict[str, object] = {
+        "name": model.name,
+        "Ts": model.Ts,
+        "plant": {
+            "continuous": plant is not None,
+            "A": A.tolist(),
+            "B": B.tolist(),
+            **({"E": E.tolist()} if E.shape[1] else {}),
+            "C": model.C.tolist(),
+            "D": model.D.tolist(),
+            "states": list(model.states),
+        },
+        "trim": {"x": model.trim.x.tolist(), "u": model.trim.u.tolist()},
+    }
+    if model.actuator is not None:
+        content["actuator"] = _actuator(model.actuator)
+    if model.sensors:
+        content["sensors"] = dict(model.sensors)
+    if model.reference is not None:
+        content["reference"] = _reference(model.reference)
+    if (uncertainty := model.uncertainty) is not None:
+        matrices = {"F": uncertainty.F.tolist(), "J1": uncertainty.J1.tolist(), "J2": uncertainty.J2.tolist()}
+        content["uncertainty"] = {**matrices, "delta_max": uncertainty.delta_max}
+    if (condition := model.condition) is not None:
+        content["condition"] = {"airspeed_m_s": condition.airspeed_m_s, "altitude_m": condition.altitude_m}
+    return content
+
+
+def _actuator(actuator: Actuator) -> Mapping[str, object]:
+    given = {"low": actuator.low, "high": actuator.high, "rate": actuator.rate, "tau": actuator.tau}
+    return {name: value.tolist() for name, value in given.items() if value is not None}
+
+
+def _reference(reference: Reference) -> Mapping[str, object]:
+    return {"Ar": reference.Ar.tolist(), "Br": reference.Br.tolist(), "Cr": reference.Cr.tolist()}
