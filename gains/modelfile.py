@@ -5,6 +5,7 @@ Every number is written at full double precision, so what is read again is the s
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +14,9 @@ import tomli_w
 
 from gains.atomic import replace_file
 from gains.model import Actuator, Matrix, Model, Reference
+
+_NUMBERS = re.compile(r"\[\s*((?:[-+0-9.e]+,\s*)+)\]")
+"""A row of numbers, one per line; a matrix is easier to read with one row per line."""
 
 __all__ = ["Continuous", "model_text", "save_model"]
 
@@ -56,8 +60,9 @@ def save_model(path: str | Path, model: Model, *, plant: Continuous | None = Non
 
 def model_text(model: Model, *, plant: Continuous | None = None, notes: Iterable[str] = ()) -> str:
     """Return the text of a model file; parameters as of :func:`save_model`."""
-    head = "".join(f"# {line}".rstrip() + "\n" for note in notes for line in note.splitlines())
-    return head + ("\n" if head else "") + tomli_w.dumps(_content(model, plant))
+    head = "".join(f"# {line}".rstrip() + "\n" for note in notes for line in note.splitlines() or [""])
+    text = tomli_w.dumps(_content(model, plant))
+    return head + ("\n" if head else "") + _NUMBERS.sub(lambda row: f"[{' '.join(row[1].split()).rstrip(',')}]", text)
 
 
 def _content(model: Model, plant: Continuous | None) -> dict[str, object]:

@@ -30,7 +30,7 @@ from sitl.aircraft.airframe import Pose, Vector
 from sitl.aircraft.linearised import STATES, Linearised
 
 if TYPE_CHECKING:
-    import jsbsim
+    from jsbsim import FGFDMExec, FGPropertyNode
 
     from sitl.aircraft.wind import Wind
 
@@ -221,7 +221,7 @@ class _Flight:
 
     Attributes
     ----------
-    fdm : jsbsim.FGFDMExec
+    fdm : FGFDMExec
     A, B : ndarray
         FGLinearization's matrices with the elevator's surface held: units rad and ft/s.
     states, inputs : list of str
@@ -234,14 +234,14 @@ class _Flight:
         The property that is the elevator's surface.
     """
 
-    fdm: jsbsim.FGFDMExec
+    fdm: FGFDMExec
     A: Matrix
     B: Matrix
     states: list[str]
     inputs: list[str]
     surface_rad: float
     throttles: list[float]
-    node: jsbsim.FGPropertyNode
+    node: FGPropertyNode
 
     @classmethod
     def trimmed(
@@ -320,7 +320,7 @@ class _Hold:
             throttles=list(flight.throttles),
         )
 
-    def act(self, fdm: jsbsim.FGFDMExec, dt_s: float) -> None:
+    def act(self, fdm: FGFDMExec, dt_s: float) -> None:
         """Command aileron, rudder and throttle for one step of JSBSim."""
         roll, p, r = fdm["attitude/phi-rad"], fdm["velocities/p-rad_sec"], fdm["velocities/r-rad_sec"]
         fdm["fcs/aileron-cmd-norm"] = _clipped(self.aileron - self.roll * roll - self.roll_rate * p, -1.0, 1.0)
@@ -342,7 +342,7 @@ def _throttle(n: int) -> str:
     return f"fcs/throttle-cmd-norm[{n}]"
 
 
-def _throttles(fdm: jsbsim.FGFDMExec) -> list[float]:
+def _throttles(fdm: FGFDMExec) -> list[float]:
     return [fdm[_throttle(n)] for n in range(fdm.get_propulsion().get_num_engines())]
 
 
@@ -392,7 +392,7 @@ def _travel(aircraft: str, vc_kts: float | None, airspeed_m_s: float | None, alt
 
 def _trimmed(
     aircraft: str, vc_kts: float | None, airspeed_m_s: float | None, altitude_m: float, dt_s: float
-) -> jsbsim.FGFDMExec:
+) -> FGFDMExec:
     """Load an aircraft and trim it in level flight, its engines running.
 
     Raises
@@ -426,7 +426,7 @@ def _trimmed(
     return fdm
 
 
-def _loaded(aircraft: str) -> jsbsim.FGFDMExec:
+def _loaded(aircraft: str) -> FGFDMExec:
     """Return JSBSim with an aircraft, which can neither talk to the network nor write files."""
     jsbsim = _jsbsim()
     known = aircraft_names()
@@ -439,12 +439,11 @@ def _loaded(aircraft: str) -> jsbsim.FGFDMExec:
         copy = Path(folder) / aircraft
         shutil.copytree(root / "aircraft" / aircraft, copy)
         _silence(copy / f"{aircraft}.xml")
-        fdm = jsbsim.FGFDMExec(str(root))
+        fdm: FGFDMExec = jsbsim.FGFDMExec(str(root))
         fdm.set_debug_level(0)
         loaded = fdm.load_model_with_paths(aircraft, folder, str(root / "engine"), str(root / "systems"))
     if not loaded:
         raise InputError(f"jsbsim:{aircraft}: expected an aircraft that JSBSim can load, found that it cannot")
-    assert isinstance(fdm, jsbsim.FGFDMExec)
     return fdm
 
 
@@ -487,5 +486,5 @@ def _jsbsim() -> Any:
         import jsbsim
     except ImportError:
         raise InputError("jsbsim: expected it to be installed: pip install 'lagproof[jsbsim]'") from None
-    jsbsim.FGJSBBase().debug_lvl = 0  # else it prints a banner
+    jsbsim.FGJSBBase().debug_lvl = 0  # type: ignore[no-untyped-call]  # else it prints a banner
     return jsbsim

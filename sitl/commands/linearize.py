@@ -106,12 +106,12 @@ def _linearised(
     if len(given) != 1 or given[0] not in takes[kind]:
         raise InputError(f"{aircraft}: expected one of {', '.join(takes[kind])}, found {', '.join(given) or 'none'}")
     if kind == "jsbsim":
-        from sitl.aircraft import jsbsim
+        from sitl.aircraft.jsbsim import linearise as linearise_jsbsim
 
-        return jsbsim.linearise(name, vc_kts=vc_kts, airspeed_m_s=tas_m_s, altitude_m=altitude_m)
-    from sitl.aircraft import trim
+        return linearise_jsbsim(name, vc_kts=vc_kts, airspeed_m_s=tas_m_s, altitude_m=altitude_m)
+    from sitl.aircraft.trim import linearise as linearise_sixdof
 
-    return trim.linearise(name, mach=mach, airspeed_m_s=tas_m_s, altitude_m=altitude_m)
+    return linearise_sixdof(name, mach=mach, airspeed_m_s=tas_m_s, altitude_m=altitude_m)
 
 
 def _notes(linearised: Any, model: Any, template: Template | None) -> list[str]:
