@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from tests.fuzz import files, links, nodes, texts, wires
+from tests.fuzz import files, links, live, nodes, texts, wires
 from tests.fuzz.refusing import Run
 
 CORPUS = Path(__file__).parent / "corpus"
@@ -141,6 +141,9 @@ TARGETS: Mapping[str, Target] = {
         (b"delay_ms", b"up_ms,down_ms", b"t_s,", b"lost", b"PING ", b"icmp_seq=", b"time=", *_NUMBERS, *_JSON),
     ),
     "table": Target(files.table, (b"delay_ms", b"\n", *_NUMBERS, *_ODD)),
+    "live": Target(
+        live.live, (b"\x89MCAP0\r\n", *(bytes((op, n)) for op in range(1, 16) for n in (0, 9)), b"plant/truth", *_JSON)
+    ),
     "recovery": Target(
         files.recovery, (b"\x89MCAP0\r\n", *(bytes((op, n)) for op in range(1, 16) for n in (0, 9)), b"\xff" * 8)
     ),
