@@ -49,7 +49,7 @@ class Law:
     trim_x: tuple[float, ...]
     travel: Travel
 
-    def command(self, x: Sequence[float], xr: Sequence[float]) -> tuple[float, bool]:
+    def command(self, x: Sequence[float], xr: Sequence[float], j: int = 0, d: int = 0) -> tuple[float, bool]:
         """Return u of Eq. (9), absolute and within the travel, and whether the travel limited it.
 
         Parameters
@@ -58,6 +58,8 @@ class Law:
             State of the sample, absolute.
         xr : sequence of float, length nr
             Reference state at the expected instant of application; empty without a reference model.
+        j, d : int
+            Of no meaning here: what other controllers ask for (:class:`autopilot.controllers.Controller`).
         """
         dx = [value - trim for value, trim in zip(x, self.trim_x, strict=True)]
         wanted = self.travel.neutral + sum(map(mul, self.K1, dx)) + sum(map(mul, self.K2, xr))

@@ -19,6 +19,7 @@ import numpy as np
 from autopilot.commander import Commander, FlightMode, Moving, Programmed, Steady, Target
 from autopilot.config import AutopilotConfig
 from autopilot.control import ChosenSets, Law, SetChooser, law_of
+from autopilot.controllers import Controller, controller_of
 from autopilot.delay import DelayEstimate
 from autopilot.failsafe import FLOWN_BY_FIRST_LAW, FLOWN_BY_LAW, Event, FailsafeState, Limits, Mode, step
 from autopilot.link.clock import NS_PER_S
@@ -30,7 +31,7 @@ from autopilot.profile import Shifted
 from autopilot.reference import ReferenceModel, match_reference
 from autopilot.state import Sample
 from autopilot.streamed import Streamed
-from gains.model import GainLaw, Gains, Model, sets_of
+from gains.model import DynamicFeedback, GainLaw, Gains, Matrix, Model, sets_of
 
 __all__ = ["Command", "Notice", "Pilot"]
 
@@ -176,7 +177,10 @@ class Pilot:
         """Give the elevator other stops; what is held now keeps them, too."""
         self.travel = travel
         self._u = travel.clip(self._u)
-        self._laws = [law_of(each, travel) for each in self.sets]
+        self._laws = [controller_of(each, travel) for each in self.sets]
+        first = self._laws[0]  # a schedule's sets are laws
+        self._stateful = None if isinstance(first, Law) else first
+        self._align = self.config.align and not isinstance(self.sets[0].controller, DynamicFeedback)
         self._conservative_law = law_of(self.conservative, travel) if self.conservative is not None else None
 
     def restart(self) -> None:
@@ -190,6 +194,8 @@ class Pilot:
         self._worth_last: tuple[Event, str] | None = None
         self.chooser = SetChooser(self.windows)
         self._chosen = ChosenSets(self.windows)
+        if self._stateful is not None:
+            self._stateful.restart()
         self._plausibility.forget()
         self.saturation.told(saturated=False, now_ns=0)
         self._u, self._saturated = self.travel.neutral, False
@@ -245,7 +251,7 @@ class Pilot:
         if not engaged:
             self._u, self._saturated = self._stick_u(), False
         elif law is not None:
-            self._u, self._saturated = law.command(sample.x, xr)
+            self._u, self._saturated = law.command(sample.x, xr, sample.j, self._ahead)
         elif self.mode is not Mode.HOLD:
             self._u, self._saturated = self.travel.neutral, False
         # another hand had the elevator, or nobody, until a law really flies; but not before the flight began
@@ -272,6 +278,8 @@ class Pilot:
     def sent(self, command: Command) -> None:
         """Take note of a command that has left; what follows from it alone could wait until now."""
         self._plausibility.commanded(command.u)
+        if self._stateful is not None:
+            self._stateful.sent(command.sample.j, command.u)
         self._next_repeat_ns = command.at_ns + self._Ts_ns
         if event := self.saturation.told(command.saturated, command.at_ns):
             self.event(event, "elevator at its limit", command.at_ns)
@@ -332,7 +340,7 @@ class Pilot:
         usable = wide is not None and all(_holds(wide, d) for d in delays)
         return Event.WIDE if usable else Event.OUTSIDE, reason
 
-    def _in_force(self, gain_set: int) -> tuple[Law | None, Gains, int]:
+    def _in_force(self, gain_set: int) -> tuple[Controller | None, Gains, int]:
         """Return the law that computes the command, if any, with its gains and the number of its set."""
         if self.config.failsafe == "on":
             if self.mode is Mode.CONSERVATIVE and self.conservative is not None:
@@ -359,7 +367,7 @@ class Pilot:
             self._aim(target)  # before the samples of a silence are gone through
         reference.advance(sample.j)
         ahead = 0
-        if self.config.align:
+        if self._align:
             unknown, most = self.window[0], self.window[1] + (MAX_AHEAD if flown else 0)
             ahead = min(forecast.d, most) if forecast.d is not None else unknown
         self._ahead = ahead
@@ -412,7 +420,11 @@ class Pilot:
         """Let the reference go on from where the aircraft is: a law takes over without a jump of the elevator."""
         if gains.K2 is None:
             return
-        dx = np.array(sample.x) - self.model.trim.x
+        dx: Matrix | None = np.array(sample.x) - self.model.trim.x
+        if self._stateful is not None and gains.controller is not None:
+            dx = self._stateful.take_over(sample.x, self._u, sample.j, ahead)
+        if dx is None:
+            return
         du, step_ahead = self._u - self.travel.neutral, reference.step_ahead(ahead)
         reference.set(match_reference(self.model, gains.K1, gains.K2, dx, du, step_ahead))
 

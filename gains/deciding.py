@@ -22,7 +22,7 @@ from gains.lower_gain import worst_gain
 from gains.model import GainLaw, Gains, Schedule
 from gains.plotdata import margins, response
 from gains.proving import write_certified
-from gains.store import load_gains, model_path, resolve
+from gains.store import load_gains, model_path, require_law, resolve
 from gains.switched import Switched, Transitions, eq9, graph
 from gains.table import InputError
 from gains.witnessfile import Witness, write_witness
@@ -202,7 +202,7 @@ def run_schedule(names: Sequence[str], output: Path, transitions: Transitions, d
     InputError
         When the gains are for different models, or their windows do not follow one another.
     """
-    sets = sorted((load_gains(name) for name in names), key=lambda gains: (gains.d_min, gains.d_max))
+    sets = sorted((require_law(load_gains(name)) for name in names), key=lambda gains: (gains.d_min, gains.d_max))
     models = {resolve(model_path(name)) for name in names}
     if len(models) > 1:
         raise InputError(f"schedule: expected gains for one model, found {', '.join(sorted(m.stem for m in models))}")

@@ -14,7 +14,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from gains.command import NEGATIVE, SUCCESS, print_json
 from gains.design import Bounds, Design, Method, Search, SteadyState, Step, design
 from gains.proving import write_certified
-from gains.store import load_gains, load_model, resolve
+from gains.store import load_gains, load_model, require_law, resolve
 from gains.switched import Transitions
 from gains.table import InputError
 from gains.weighting import Weighting
@@ -48,7 +48,7 @@ def run_design(
         When an option does not fit the model, or the file cannot be written.
     """
     model = load_model(model_name)
-    start = None if options["start"] is None else load_gains(options["start"])
+    start = None if options["start"] is None else require_law(load_gains(options["start"]))
     begun = _clock()
     with _Reporter() as reporter:
         try:

@@ -7,10 +7,12 @@ The conservative gains that a file may name are proved by a certificate of their
 
 from __future__ import annotations
 
+from dataclasses import fields
+
 import numpy as np
 
 from gains.certificate import claim_hash, law_hash, model_hash
-from gains.model import GainLaw, Gains, Matrix, Model, Schedule
+from gains.model import Controller, DynamicFeedback, GainLaw, Gains, Matrix, Model, Schedule, SmithPredictor
 from gains.table import InputError, Table
 
 __all__ = ["DELAY_LIMIT", "check_conservative", "content_of", "read_gains", "read_schedule"]
@@ -21,8 +23,14 @@ DELAY_LIMIT = 1000  # samples; buffers in the loop grow with d_max
 def read_gains(table: Table, name: str, model: Model) -> Gains:
     """Return the one set of gains of a file, its certificate with it."""
     d_min, d_max = _window(table)
-    K1, K2 = _matrices(table, model)
-    gains = Gains(name, model, d_min, d_max, K1, K2, table.mapping("certificate", None))
+    controller = _controller(table, model)
+    if isinstance(controller, DynamicFeedback):
+        K1, K2 = np.zeros((model.nu, model.nx)), None if model.reference is None else np.zeros((model.nu, model.nr))
+    else:
+        K1, K2 = _matrices(table, model)
+    gains = Gains(name, model, d_min, d_max, K1, K2, table.mapping("certificate", None), controller=controller)
+    if controller is not None and gains.certificate is not None:
+        raise table.error("certificate", "none, as no proof speaks of this controller", "one")
     _check_hashes(table.source, gains, "K1 and K2")
     return gains
 
@@ -95,7 +103,39 @@ def content_of(law: GainLaw, model: str, conservative: str | None) -> dict[str, 
 
 def _set_content(gains: Gains) -> dict[str, object]:
     K2 = {} if gains.K2 is None else {"K2": gains.K2.tolist()}
-    return {"d_min": gains.d_min, "d_max": gains.d_max, "K1": gains.K1.tolist(), **K2}
+    window = {"d_min": gains.d_min, "d_max": gains.d_max}
+    match gains.controller:
+        case None:
+            return {**window, "K1": gains.K1.tolist(), **K2}
+        case SmithPredictor():
+            return {**window, "controller": "smith", "K1": gains.K1.tolist(), **K2}
+        case DynamicFeedback() as dynamic:
+            matrices = {entry.name: getattr(dynamic, entry.name).tolist() for entry in fields(dynamic)}
+            return {**window, "controller": "dynamic", "dynamic": matrices}
+
+
+def _controller(table: Table, model: Model) -> Controller | None:
+    """Return what flies instead of the law; None where the file says nothing of it."""
+    kind = table.string("controller", "law", choices=("law", "smith", "dynamic"))
+    if kind == "law":
+        return None
+    if kind == "smith":
+        return SmithPredictor()
+    dynamic = table.table("dynamic")
+    nx, nu, ny = model.nx, model.nu, model.ny
+    Ac = dynamic.matrix("Ac")
+    nc = Ac.shape[0]
+    if Ac.shape[1] != nc:
+        raise dynamic.error("Ac", "a square matrix", f"{nc} by {Ac.shape[1]}")
+    return DynamicFeedback(
+        Ac=Ac,
+        Bc=dynamic.matrix("Bc", shape=(nc, nx)),
+        Bcr=dynamic.matrix("Bcr", shape=(nc, ny)),
+        L=dynamic.matrix("L", np.zeros((nc, nu)), shape=(nc, nu)),
+        Cc=dynamic.matrix("Cc", shape=(nu, nc)),
+        Dc=dynamic.matrix("Dc", shape=(nu, nx)),
+        Dcr=dynamic.matrix("Dcr", shape=(nu, ny)),
+    )
 
 
 def _window(table: Table) -> tuple[int, int]:

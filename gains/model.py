@@ -22,12 +22,15 @@ __all__ = [
     "Actuator",
     "Augmented",
     "Condition",
+    "Controller",
+    "DynamicFeedback",
     "GainLaw",
     "Gains",
     "Matrix",
     "Model",
     "Reference",
     "Schedule",
+    "SmithPredictor",
     "Trim",
     "Uncertainty",
     "augmented",
@@ -236,6 +239,47 @@ class Model:
         return 0 if self.reference is None else int(self.reference.Ar.shape[0])
 
 
+@dataclass(frozen=True, slots=True)
+class SmithPredictor:
+    """The law on a predicted state, u(k) = K1 x^(j + d) + K2 xr(j + d), from the commands that are under way."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DynamicFeedback:
+    """A linear dynamic controller in place of the law, of deviations from trim.
+
+        xc(k+1) = Ac xc(k) + Bc x(k) + Bcr yr(k) + L (u(k) - v(k)),   v(k) = Cc xc(k) + Dc x(k) + Dcr yr(k)
+
+    u is v within the elevator's travel. A column of zeros in Bc and Dc is a state that is not measured.
+
+    Attributes
+    ----------
+    Ac : ndarray, shape (nc, nc)
+    Bc : ndarray, shape (nc, nx)
+    Bcr : ndarray, shape (nc, ny)
+    L : ndarray, shape (nc, nu)
+        Anti-windup: what a limited elevator takes back.
+    Cc : ndarray, shape (nu, nc)
+    Dc : ndarray, shape (nu, nx)
+    Dcr : ndarray, shape (nu, ny)
+    """
+
+    Ac: Matrix
+    Bc: Matrix
+    Bcr: Matrix
+    L: Matrix
+    Cc: Matrix
+    Dc: Matrix
+    Dcr: Matrix
+
+    def __post_init__(self) -> None:
+        _freeze(self)
+
+
+Controller: TypeAlias = SmithPredictor | DynamicFeedback
+"""What may fly instead of the law of Eq. (9), to compare; no certificate speaks of it."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Gains:
     """The law u(k) = K1 x(k − d(k)) + K2 xr(k), Eq. (9), and the delays it may be used at.
@@ -256,6 +300,8 @@ class Gains:
         a certificate of their own, and no conservative gains.
     conservative_file : Path or None
         The file of the conservative gains, for naming it again; of no meaning without them.
+    controller : Controller or None
+        What flies instead of the law of Eq. (9); None for the law. K1 and K2 of a dynamic controller are zero.
     """
 
     name: str
@@ -267,6 +313,7 @@ class Gains:
     certificate: Mapping[str, object] | None = None
     conservative: Gains | None = None
     conservative_file: Path | None = None
+    controller: Controller | None = None
 
     def __post_init__(self) -> None:
         _freeze(self)

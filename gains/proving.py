@@ -17,7 +17,7 @@ import click
 from gains.command import NEGATIVE, SUCCESS, FiniteRange, print_json, require_writable, version
 from gains.gainfile import check_conservative
 from gains.model import GainLaw, Gains, Schedule
-from gains.store import DELAY_LIMIT, load_gains, load_law, model_path, save_gains
+from gains.store import DELAY_LIMIT, load_gains, load_law, model_path, require_law, save_gains
 from gains.table import InputError
 
 if TYPE_CHECKING:
@@ -105,7 +105,7 @@ def certify(
     paper prints them: sufficient, without a proof the answer is 'undecided'. A proof for transitions 'any' holds for
     'fifo' too.
     """
-    law = load_law(name)
+    law = require_law(load_law(name))
     d_min, d_max = (law.d_min, law.d_max) if delay is None else parse_window(delay)
     if delta > 0.0 and law.model.uncertainty is None:
         raise InputError(f"--delta: expected 0, as model {law.model.name} has no [uncertainty], found {delta:g}")
@@ -120,7 +120,7 @@ def certify(
 
         question = Question(law, d_min, d_max, transitions, delta, memory, flown)
         return run_certify(question, name, output, as_json=as_json)
-    gains = load_gains(name)
+    gains = require_law(load_gains(name))
     if d_max < 1:
         raise InputError("--delay: expected a window up to at least 1 sample, found 0:0")
     return _certify_sufficient(gains, name, (d_min, d_max), method, transitions, delta, output, as_json=as_json)
@@ -186,7 +186,7 @@ def bound(
     'exact' gives a proof at d_max and a delay sequence that breaks d_max + 1; --plot draws growth and gain against
     the delay. 'lyapunov' is Lemma 1, a sufficient condition; 'constant' is exact for delays that never change.
     """
-    law = load_law(name)
+    law = require_law(load_law(name))
     if limit < d_min:
         raise InputError(f"--limit: expected at least d_min ({d_min}), found {limit}")
     if isinstance(law, Schedule) and not d_min <= law.d_min <= law.d_max <= limit:
@@ -199,7 +199,7 @@ def bound(
         return run_bound(law, d_min, limit, transitions, as_json=as_json, plot=plot)
     if plot is not None:
         raise InputError(f"--plot: expected method exact, found {method}")
-    return _bound_sufficient(load_gains(name), d_min, limit, method, transitions, as_json=as_json)
+    return _bound_sufficient(require_law(load_gains(name)), d_min, limit, method, transitions, as_json=as_json)
 
 
 def _bound_sufficient(gains: Gains, d_min: int, limit: int, method: str, transitions: str, *, as_json: bool) -> int:
@@ -250,7 +250,7 @@ def witness(name: str, delay: str, transitions: Transitions, output: Path, plot:
     The sequence of largest growth found is written; its growth is confirmed in multiple precision. 'sitl relay
     --witness' and the scenarios 'witness' fly it. --plot draws the loop under it.
     """
-    gains, window = load_gains(name), parse_window(delay)
+    gains, window = require_law(load_gains(name)), parse_window(delay)
     from gains.deciding import run_witness
 
     return run_witness(gains, window, transitions, output, as_json=as_json, plot=plot)

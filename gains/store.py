@@ -13,7 +13,7 @@ import re
 from dataclasses import replace
 from importlib import resources
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, TypeVar
 
 import numpy as np
 import tomli_w
@@ -46,6 +46,7 @@ __all__ = [
     "parse_gains",
     "parse_law",
     "parse_model",
+    "require_law",
     "resolve",
     "save_gains",
     "stored",
@@ -55,6 +56,7 @@ TS_MIN_S, TS_MAX_S = 1e-6, 3600.0
 _SENSOR = re.compile(r"[A-Z][A-Z0-9_]*\.[A-Za-z][A-Za-z0-9_]*")
 
 Kind = Literal["model", "gains"]
+AnyLaw = TypeVar("AnyLaw", bound=GainLaw)
 
 
 class Stored(NamedTuple):
@@ -190,6 +192,22 @@ def parse_law(table: Table) -> GainLaw:
     return replace(law, conservative=replace(gains, model=law.model), conservative_file=file)
 
 
+def require_law(law: AnyLaw) -> AnyLaw:
+    """Return gains that fly the law of Eq. (9), of which proofs speak.
+
+    Raises
+    ------
+    InputError
+        When another controller flies in its place.
+    """
+    if isinstance(law, Gains) and law.controller is not None:
+        kind = type(law.controller).__name__
+        raise InputError(
+            f"{law.name}: expected gains of the law u = K1 x + K2 xr, found a {kind}: no proof speaks of it"
+        )
+    return law
+
+
 def model_path(gains_name_or_path: str | Path) -> Path:
     """Return the file of the model that a gain file names.
 
@@ -250,6 +268,8 @@ def _parse_conservative(table: Table, file: Path) -> Gains:
     gains = _parse_alone(named)
     named.finish()
     assert isinstance(gains, Gains)
+    if gains.controller is not None:
+        raise table.error("conservative", "gains of the law u = K1 x + K2 xr", f"{name}, another controller")
     return gains
 
 

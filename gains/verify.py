@@ -31,6 +31,8 @@ def verified(gains: GainLaw) -> Verification:
     InputError
         When a field of the certificate is missing or malformed.
     """
+    if isinstance(gains, Gains) and gains.controller is not None:
+        return failed("no proof speaks of this controller")
     if gains.certificate is None:
         return failed("there is no certificate")
     if gains.certificate.get("method") == SwitchedCertificate.method:

@@ -16,6 +16,7 @@ import errno
 import os
 from collections.abc import Iterator, Mapping
 from io import FileIO
+from types import MappingProxyType
 from typing import IO, Any, Self, cast
 
 import numpy as np
@@ -51,6 +52,7 @@ MAX_CHUNK_NS = 500_000_000
 FRAMES_PER_FLUSH = 64
 MAX_FLUSH_US = MAX_CHUNK_NS // 1000
 METADATA_NAME = "flight"
+ATTACHMENT_TYPE = "application/toml"
 
 _PROFILE = "lagproof"
 _TIME_LIMIT_NS = 1 << 63
@@ -183,6 +185,9 @@ class McapRecorder:
         The file; an existing one is replaced.
     metadata : mapping of str to str
         Written once at the start under the name ``flight``: scenario, seed, versions and so on.
+    attachments : mapping of str to bytes, optional
+        Texts of the files that the flight was flown with, by name; written at the start, too, so that a recording
+        that is cut off has them.
 
     Attributes
     ----------
@@ -199,7 +204,12 @@ class McapRecorder:
         If the file cannot be opened or takes no header.
     """
 
-    def __init__(self, path: str | os.PathLike[str], metadata: Mapping[str, str]):
+    def __init__(
+        self,
+        path: str | os.PathLike[str],
+        metadata: Mapping[str, str],
+        attachments: Mapping[str, bytes] = MappingProxyType({}),
+    ):
         self.lost = 0
         self.refused = 0
         self._file = _File(path)
@@ -213,6 +223,9 @@ class McapRecorder:
         if not self._file.drain():
             self._file.close()
             raise OSError(self._file.error)
+        for name, content in attachments.items():  # at time 0: nothing of the wall clock
+            self._writer.add_attachment(0, 0, name, ATTACHMENT_TYPE, content)
+        self._file.drain()  # a disk that is full by now ends the recording, not the flight
 
     @property
     def error(self) -> str:

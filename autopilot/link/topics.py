@@ -100,7 +100,7 @@ SCHEMAS: Mapping[str, Mapping[str, Any]] = MappingProxyType(
             optional={
                 "air": _field(
                     "object",
-                    "What else moves, of an aircraft that is more than the model's states: SI units, rad, throttle 0 to 1.",
+                    "What else moves, of an aircraft that is more than its model: SI units, rad, throttle 0 to 1.",
                     properties={},
                     additionalProperties={"type": "number"},
                 ),

@@ -220,10 +220,10 @@ GAINS_COMPLAINTS = [
     ("K2", [[1.0]], "K2: expected 3 columns, found 1"),
     ("K2", GONE, "K2: expected a matrix (an array of rows), found nothing"),
     ("certificate", 1, "certificate: expected a table, found 1"),
-    ("certficate", {}, "certficate: expected one of name, model, d_min, d_max, K1, K2, certificate, conservative, "
-                       "found an unknown key; did you mean certificate?"),
-    ("conservativ", "hirm-d6", "conservativ: expected one of name, model, d_min, d_max, K1, K2, certificate, "
-                               "conservative, found an unknown key; did you mean conservative?"),
+    ("certficate", {}, "certficate: expected one of name, model, d_min, d_max, controller, K1, K2, certificate, "
+                       "conservative, found an unknown key; did you mean certificate?"),
+    ("conservativ", "hirm-d6", "conservativ: expected one of name, model, d_min, d_max, controller, K1, K2, "
+                               "certificate, conservative, found an unknown key; did you mean conservative?"),
     ("conservative", 6, "conservative: expected a string, found 6"),
     ("conservative", "", 'conservative: expected a string, found the string ""'),
     ("conservative", {}, "conservative: expected a string, found a table"),
@@ -455,8 +455,8 @@ def test_a_model_of_another_name_and_the_same_content_is_the_same_model(tmp_path
     ("fields", "complaint"),
     [
         ({"K1": [[1.0]]}, "K1: expected 3 columns, found 1"),
-        ({"d_mox": 6}, "d_mox: expected one of name, model, d_min, d_max, K1, K2, certificate, found an unknown key; "
-                       "did you mean d_max?"),
+        ({"d_mox": 6}, "d_mox: expected one of name, model, d_min, d_max, controller, K1, K2, certificate, "
+                       "found an unknown key; did you mean d_max?"),
         ({"certificate": {}}, "certificate.sha256: expected a table, found nothing"),
         ({"model": "nowhere"}, "model: nowhere: expected a stored name or a file, found neither"),
     ],
@@ -531,8 +531,10 @@ def test_one_kind_of_file_is_not_the_other() -> None:
 def test_stored_files_load_under_their_own_names() -> None:
     entries = stored()
     assert [(e.name, e.kind) for e in entries] == [
-        ("hirm", "model"), ("hirm-printed", "model"), ("pendulum", "model"), ("pendulum-exact", "model"),
-        ("hirm-d3", "gains"), ("hirm-d4", "gains"), ("hirm-d6", "gains"), ("hirm-paper", "gains"),
+        ("hirm", "model"), ("hirm-6dof", "model"), ("hirm-printed", "model"), ("pendulum", "model"),
+        ("pendulum-exact", "model"),
+        ("hirm-6dof-d6", "gains"), ("hirm-d3", "gains"), ("hirm-d4", "gains"), ("hirm-d6", "gains"),
+        ("hirm-dfsm", "gains"), ("hirm-lq", "gains"), ("hirm-paper", "gains"), ("hirm-smith", "gains"),
         ("pendulum-exact-paper", "gains"), ("pendulum-paper", "gains"),
     ]  # fmt: skip
     for entry in entries:
