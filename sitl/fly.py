@@ -24,6 +24,7 @@ from sitl.aircraft.wind import format_wind
 from sitl.faults import DiskFull, Fault
 from sitl.flight import fly_virtual
 from sitl.flightdata import FlightData
+from sitl.flightfile import attachments_of
 from sitl.injector import Injector, check_feasible
 from sitl.link.changes import format_change
 from sitl.link.rules import format_rule
@@ -81,7 +82,10 @@ def fly(scenario: Scenario, options: FlightOptions, console: Console) -> Outcome
     with ExitStack() as stack:
         interrupted = stack.enter_context(_interruptible())
         tlog_port = "gcs0" if options.ground_stations else "plant"
-        recorder = stack.enter_context(FlightRecorder(options.folder, _metadata(scenario, options), unix_us, tlog_port))
+        files = {} if options.folder is None else attachments_of(scenario.gains_name, scenario.plant_name)
+        recorder = stack.enter_context(
+            FlightRecorder(options.folder, _metadata(scenario, options), unix_us, tlog_port, files)
+        )
         view = stack.enter_context(FlightView(scenario, console, virtual=options.virtual))
         if options.virtual:
             _fly_in_process(scenario, options, recorder, view, interrupted)

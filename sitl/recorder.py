@@ -16,6 +16,7 @@ import os
 import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Self
 
 from autopilot.link.clock import NS_PER_US
@@ -45,6 +46,8 @@ class FlightRecorder:
         Unix time of the start of the flight, for the tlog; 0 in virtual time, where there is none.
     tlog_port : str
         The port whose frames the tlog holds: one link, as a ground station would have logged it.
+    attachments : mapping of str to bytes, optional
+        Files that the MCAP file shall hold, by name.
 
     Attributes
     ----------
@@ -64,7 +67,12 @@ class FlightRecorder:
     """
 
     def __init__(
-        self, folder: Path | None, metadata: Mapping[str, str], unix_us: int = 0, tlog_port: str = "gcs0"
+        self,
+        folder: Path | None,
+        metadata: Mapping[str, str],
+        unix_us: int = 0,
+        tlog_port: str = "gcs0",
+        attachments: Mapping[str, bytes] = MappingProxyType({}),
     ) -> None:
         self.kept: list[Kept] = []
         self.unkept = 0
@@ -82,7 +90,7 @@ class FlightRecorder:
         try:
             folder.mkdir(parents=True, exist_ok=True)
             self.files = {"mcap": folder / "flight.mcap", "tlog": folder / "flight.tlog"}
-            self._mcap = McapRecorder(self.files["mcap"], metadata)
+            self._mcap = McapRecorder(self.files["mcap"], metadata, attachments)
             self._tlog = TlogWriter(self.files["tlog"])
         except OSError as error:
             raise InputError(f"{folder}: {error.strerror or error}") from None
