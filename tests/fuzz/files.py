@@ -32,6 +32,7 @@ from gains.table import InputError, Table
 from gains.verify import verified
 from gains.witnessfile import read_witness, write_witness
 from sitl.arguments import autopilot_arguments, plant_arguments, relay_arguments
+from sitl.flightfile import load_flight
 from sitl.link.tracefiles import MAX_DELAY_NS, load_table, load_trace
 from sitl.rescue import recover
 from sitl.scenario import load_scenario
@@ -224,6 +225,15 @@ def recovery(data: bytes) -> None:
     again = recover(target, _folder() / "again.mcap", force=True)
     assert again.complete, again
     assert again.messages == rescue.messages
+
+
+@refusing(InputError)
+def flight(data: bytes) -> None:
+    """A finished recording: a flight with finite times and as many samples as it says, or one line of refusal."""
+    found = load_flight(written(data, "flight.mcap"))
+    assert len(found.flight.time_s) == len(found.flight.k) > 0
+    assert np.isfinite(found.flight.time_s).all()
+    assert found.law.model.states == found.flight.model.states
 
 
 def _toml(data: bytes) -> dict[str, Any]:

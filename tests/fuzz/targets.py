@@ -141,6 +141,10 @@ TARGETS: Mapping[str, Target] = {
         (b"delay_ms", b"up_ms,down_ms", b"t_s,", b"lost", b"PING ", b"icmp_seq=", b"time=", *_NUMBERS, *_JSON),
     ),
     "table": Target(files.table, (b"delay_ms", b"\n", *_NUMBERS, *_ODD)),
+    "flight": Target(
+        files.flight,
+        (b"\x89MCAP0\r\n", *(bytes((op, n)) for op in range(1, 16) for n in (0, 9)), b"plant/truth", *_JSON),
+    ),
     "live": Target(
         live.live, (b"\x89MCAP0\r\n", *(bytes((op, n)) for op in range(1, 16) for n in (0, 9)), b"plant/truth", *_JSON)
     ),
