@@ -14,7 +14,8 @@ from threadpoolctl import threadpool_limits
 
 from gains.command import print_json, run, version
 from gains.frontier import frontier
-from gains.model import GainLaw, Gains, Matrix, Model, Schedule, sets_of
+from gains.model import DynamicFeedback, GainLaw, Gains, Matrix, Model, Schedule, SmithPredictor, sets_of
+from gains.modelling import baseline, export, import_, reference
 from gains.proving import JSON_OPTION, bound, certify, design, schedule, witness
 from gains.store import load, load_law, load_model, stored
 from gains.verify import verified
@@ -22,6 +23,7 @@ from gains.verify import verified
 __all__ = ["cli", "main"]
 
 _SET = ("d_min", "d_max", "K1", "K2")
+_DYNAMIC = ("Ac", "Bc", "Bcr", "L", "Cc", "Dc", "Dcr")
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"]})
@@ -69,7 +71,7 @@ def show(name: str, as_json: bool) -> None:
         _show_law(_console(), item)
 
 
-for command in (certify, bound, witness, schedule, design, frontier):
+for command in (certify, bound, witness, schedule, design, frontier, reference, baseline, export, import_):
     cli.add_command(command)
 
 
@@ -112,9 +114,21 @@ def _law_json(law: GainLaw) -> dict[str, object]:
         "d_min": law.d_min,
         "d_max": law.d_max,
         **({"window": [_fields(gains, *_SET) for gains in sets_of(law)]} if scheduled else _fields(law, "K1", "K2")),
+        **_controller_json(law),
         "certificate": _certificate(law),
         "conservative": None if law.conservative is None else _conservative_json(law.conservative),
     }
+
+
+def _controller_json(law: GainLaw) -> dict[str, object]:
+    """Return which controller flies, and the matrices of a dynamic one."""
+    match None if isinstance(law, Schedule) else law.controller:
+        case None:
+            return {"controller": "law"}
+        case DynamicFeedback() as dynamic:
+            return {"controller": "dynamic", "dynamic": _fields(dynamic, *_DYNAMIC)}
+        case SmithPredictor():
+            return {"controller": "smith"}
 
 
 def _conservative_json(gains: Gains) -> dict[str, object]:
@@ -200,9 +214,26 @@ def _show_law(console: Console, law: GainLaw) -> None:
 
 def _show_gains(console: Console, gains: Gains) -> None:
     inputs = _labels("u", gains.model.nu)
+    if isinstance(gains.controller, DynamicFeedback):
+        _show_dynamic(console, gains, gains.controller)
+        return
+    if gains.controller is not None:
+        console.print("controller: Smith predictor, u = K1 x^(j + d) + K2 xr(j + d)")
     console.print(_matrix("K1", gains.K1, inputs, gains.model.states))
     if gains.K2 is not None:
         console.print(_matrix("K2", gains.K2, inputs, _labels("xr", gains.model.nr)))
+
+
+def _show_dynamic(console: Console, gains: Gains, dynamic: DynamicFeedback) -> None:
+    """Show a controller that has a state of its own."""
+    console.print("controller: xc(k+1) = Ac xc + Bc x + Bcr yr + L (u - v), v = Cc xc + Dc x + Dcr yr")
+    model = gains.model
+    states, inputs, outputs = _labels("xc", dynamic.Ac.shape[0]), _labels("u", model.nu), _labels("yr", model.ny)
+    columns = {"c": states, "x": model.states, "r": outputs, "L": inputs}
+    for rows, names in ((states, (("Ac", "c"), ("Bc", "x"), ("Bcr", "r"), ("L", "L"))),
+                        (inputs, (("Cc", "c"), ("Dc", "x"), ("Dcr", "r")))):  # fmt: skip
+        matrices = [_matrix(name, getattr(dynamic, name), rows, columns[kind]) for name, kind in names]
+        console.print(Columns(matrices, padding=0))
 
 
 def _show_windows(console: Console, schedule: Schedule) -> None:

@@ -14,11 +14,15 @@ import tomli_w
 
 from gains.atomic import replace_file
 from gains.model import Actuator, Matrix, Model, Reference
+from gains.table import InputError
 
-_NUMBERS = re.compile(r"\[\s*((?:[-+0-9.e]+,\s*)+)\]")
-"""A row of numbers, one per line; a matrix is easier to read with one row per line."""
+__all__ = ["Continuous", "model_content", "model_text", "save_model"]
 
-__all__ = ["Continuous", "model_text", "save_model"]
+_NUMBERS = re.compile(r"\[\n((?: +[-+0-9.e]+,\n)+) *\]")
+"""A row of numbers, one per line; a matrix is easier to read with one row per line. No string has line ends in it."""
+_NO_COMMENT = re.compile("[\x00-\x08\x0a-\x1f\x7f\ud800-\udfff]")
+"""What TOML, or UTF-8, has no room for in a comment."""
+_SURROGATE = re.compile("[\ud800-\udfff]")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -55,17 +59,30 @@ def save_model(path: str | Path, model: Model, *, plant: Continuous | None = Non
     InputError
         When the file cannot be written.
     """
-    replace_file(Path(path), model_text(model, plant=plant, notes=notes).encode())
+    try:
+        replace_file(Path(path), model_text(model, plant=plant, notes=notes).encode())
+    except OSError as error:
+        raise InputError(f"{path}: expected a file that can be written, found: {error.strerror}") from None
 
 
 def model_text(model: Model, *, plant: Continuous | None = None, notes: Iterable[str] = ()) -> str:
-    """Return the text of a model file; parameters as of :func:`save_model`."""
-    head = "".join(f"# {line}".rstrip() + "\n" for note in notes for line in note.splitlines() or [""])
-    text = tomli_w.dumps(_content(model, plant))
+    """Return the text of a model file; parameters as of :func:`save_model`.
+
+    Raises
+    ------
+    InputError
+        When the model's name is no text that UTF-8 has room for.
+    """
+    if not model.name or _SURROGATE.search(model.name):
+        raise InputError(f"name: expected a name in UTF-8, found {model.name!r}")
+    lines = (_NO_COMMENT.sub("\ufffd", line) for note in notes for line in note.splitlines() or [""])
+    head = "".join(f"# {line}".rstrip() + "\n" for line in lines)
+    text = tomli_w.dumps(model_content(model, plant))
     return head + ("\n" if head else "") + _NUMBERS.sub(lambda row: f"[{' '.join(row[1].split()).rstrip(',')}]", text)
 
 
-def _content(model: Model, plant: Continuous | None) -> dict[str, object]:
+def model_content(model: Model, plant: Continuous | None = None) -> dict[str, object]:
+    """Return what a model file says, as TOML has it; parameters as of :func:`save_model`."""
     A, B, E = (model.A, model.B, model.E) if plant is None else (plant.Ap, plant.Bp, plant.Ep)
     content: dict[str, object] = {
         "name": model.name,

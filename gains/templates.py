@@ -16,7 +16,7 @@ from typing import Literal
 
 import numpy as np
 
-from gains.model import Matrix, Model, Reference, spectral_radius, zero_order_hold
+from gains.model import Matrix, Model, Reference, zero_order_hold
 from gains.table import InputError
 
 __all__ = ["DAMPING", "TEMPLATES", "Template", "short_period", "with_reference"]
@@ -32,6 +32,12 @@ BANDWIDTH_SHARE = 0.5
 BANDWIDTH_MIN, BANDWIDTH_MAX = 0.5, 1.0
 """Default bandwidth, rad/s: half of the short period's frequency, within these; ours."""
 GRAVITY = 9.80665
+
+SLOWEST_RAD_S = 1e-3
+"""No bandwidth is below this, or above half the sampling rate: none of those could be told in a flight."""
+DAMPING_LOW, DAMPING_HIGH = 0.01, 100.0
+STEADY_MIN = 1e-9
+"""What a unit of elevator must leave behind in the output."""
 
 _STATES = ("alpha_rad", "q_rad_s", "theta_rad")
 
@@ -59,17 +65,16 @@ def with_reference(
     """
     if model.nu != 1 or model.ny != 1:
         raise InputError(f"{model.name}: expected one input and one output, found {model.nu} and {model.ny}")
-    for name, value in (("bandwidth", bandwidth), ("damping", damping)):
-        if value is not None and not (math.isfinite(value) and value > 0.0):
-            raise InputError(f"{name}: expected a number above 0, found {value:g}")
+    for name, value, low, high in (
+        ("bandwidth", bandwidth, SLOWEST_RAD_S, math.pi / model.Ts),
+        ("damping", damping, DAMPING_LOW, DAMPING_HIGH),
+    ):
+        if value is not None and not low <= value <= high:
+            raise InputError(f"{name}: expected a number from {low:g} to {high:g}, found {value:g}")
     if template == "level1":
         reference = _level1(model, bandwidth, damping)
     else:
         reference = _second_order(model, 1.0 if bandwidth is None else bandwidth, damping)
-    if not spectral_radius(reference.Ar) < 1.0:
-        raise InputError(
-            f"{model.name}: expected a stable reference, found spectral radius 1: a larger bandwidth, perhaps"
-        )
     return replace(model, reference=reference)
 
 
@@ -77,30 +82,58 @@ def short_period(model: Model) -> tuple[float, float]:
     """Return frequency, rad/s, and damping of the short period: of alpha and q, with pitch and speed held.
 
     A real pair counts as one of the frequency that its product gives; the damping is then 1 or more.
+
+    Raises
+    ------
+    InputError
+        When the model has no alpha_rad and q_rad_s, or is no motion in continuous time that was sampled.
     """
+    return _frequency_and_damping(_alpha_and_q(model))
+
+
+def _frequency_and_damping(motion: Matrix) -> tuple[float, float]:
+    frequency = math.sqrt(abs(float(np.linalg.det(motion))))
+    return frequency, float(-np.trace(motion) / (2.0 * frequency)) if frequency else 1.0
+
+
+def _alpha_and_q(model: Model) -> Matrix:
+    """Return the motion of alpha and q in continuous time, the other states held; shape (2, 2), per second."""
+    from scipy.linalg import logm  # costs 0.2 s
+
+    if not set(_STATES[:2]) <= set(model.states):
+        raise InputError(f"{model.name}: expected states {_STATES[0]} and {_STATES[1]}, found {_listed(model)}")
     rows = [model.states.index(name) for name in _STATES[:2]]
-    poles = np.log(np.linalg.eigvals(model.A[np.ix_(rows, rows)]).astype(complex)) / model.Ts
-    frequency = math.sqrt(abs(float(np.prod(poles).real)))
-    return frequency, float(-np.sum(poles).real / (2.0 * frequency)) if frequency else 1.0
+    sampled = model.A[np.ix_(rows, rows)]
+    poles = np.linalg.eigvals(sampled).astype(complex)
+    if ((np.abs(poles.imag) < 1e-12) & (poles.real <= 0.0)).any():
+        raise InputError(f"{model.name}: expected a short period that was sampled, found a discrete pole at 0 or below")
+    return np.asarray(logm(sampled).real / model.Ts, dtype=np.float64)
+
+
+def _listed(model: Model) -> str:
+    return ", ".join(model.states)
 
 
 def _level1(model: Model, bandwidth: float | None, damping: float) -> Reference:
     if set(model.states) != set(_STATES):
         raise InputError(
-            f"{model.name}: expected states {', '.join(_STATES)} for template level1, found {', '.join(model.states)}"
+            f"{model.name}: expected states {', '.join(_STATES)} for template level1, found {_listed(model)}"
         )
     pitch = model.states.index("theta_rad")
     if not np.array_equal(model.C[0], np.eye(model.nx)[pitch]) or model.D.any():
         raise InputError(f"{model.name}: C: expected the pitch angle as output for template level1, found another one")
-    low, high = _level1_frequencies(model)
-    frequency = min(max(short_period(model)[0], low), high)
+    motion = _alpha_and_q(model)
+    low, high = _level1_frequencies(model, motion)
+    frequency = min(max(_frequency_and_damping(motion)[0], low), high)
     if bandwidth is None:
         bandwidth = min(max(BANDWIDTH_SHARE * frequency, BANDWIDTH_MIN), BANDWIDTH_MAX)
     beside = frequency * np.sqrt(complex(1.0 - damping**2)) * 1j
     poles = np.exp(model.Ts * np.array([-bandwidth, -damping * frequency + beside, -damping * frequency - beside]))
     K = -_place(model, poles)
     Ar = model.A + model.B @ K
-    gain = model.C @ np.linalg.solve(np.eye(model.nx) - Ar, model.B)
+    gain = float((model.C @ np.linalg.solve(np.eye(model.nx) - Ar, model.B)).item())
+    if abs(gain) < STEADY_MIN:
+        raise InputError(f"{model.name}: expected an elevator that can hold another pitch angle, found one that cannot")
     return Reference(Ar, model.B / gain, model.C)
 
 
@@ -117,16 +150,18 @@ def _place(model: Model, poles: Matrix) -> Matrix:
     return np.asarray(np.linalg.solve(reach.T, np.eye(n)[-1]) @ polynomial).reshape(1, n)
 
 
-def _level1_frequencies(model: Model) -> tuple[float, float]:
+def _level1_frequencies(model: Model, motion: Matrix) -> tuple[float, float]:
     """Return the short-period frequencies of level 1, rad/s; without a condition all are.
 
     n/alpha, the load factor per radian, is V/g times the damping of alpha, -Z_alpha.
     """
     if model.condition is None:
         return 0.0, math.inf
-    row, Ts = model.states.index("alpha_rad"), model.Ts
-    Z_alpha = (model.A[row, row] - 1.0) / Ts
-    load = max(-Z_alpha, 1e-3) * model.condition.airspeed_m_s / GRAVITY
+    load = -float(motion[0, 0]) * model.condition.airspeed_m_s / GRAVITY
+    if not load > 0.0:
+        raise InputError(
+            f"{model.name}: expected lift that rises with alpha for template level1, found Z_alpha = {motion[0, 0]:.3g}"
+        )
     return math.sqrt(CAP_MIN * load), math.sqrt(CAP_MAX * load)
 
 

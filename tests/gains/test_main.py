@@ -33,7 +33,7 @@ def process(*arguments: str) -> subprocess.CompletedProcess[str]:
 def test_list_names_everything_stored() -> None:
     text = invoke("list")
     entries = json.loads(invoke("list", "--json"))["stored"]
-    assert len(entries) == 10
+    assert len(entries) == 15
     for entry in entries:
         assert entry["name"] in text
         assert Path(entry["path"]).is_file()
@@ -61,7 +61,7 @@ def test_show_json_of_gains_is_the_gains() -> None:
     assert shown == {
         "kind": "gains", "name": "hirm-paper", "model": "hirm", "Ts": 0.025, "d_min": 1, "d_max": 4,
         "K1": gains.K1.tolist(), "K2": gains.K2.tolist() if gains.K2 is not None else None,
-        "certificate": "none", "conservative": None,
+        "certificate": "none", "conservative": None, "controller": "law",
     }  # fmt: skip
 
 
@@ -273,7 +273,7 @@ def test_show_json_of_a_schedule_is_the_schedule(schedule: Path) -> None:
             {"d_min": 1, "d_max": 2, "K1": gains.K1.tolist(), "K2": K2},
             {"d_min": 2, "d_max": 4, "K1": (gains.K1 + 0.25).tolist(), "K2": K2},
         ],
-        "certificate": "none", "conservative": None,
+        "certificate": "none", "conservative": None, "controller": "law",
     }  # fmt: skip
 
 

@@ -173,7 +173,7 @@ def test_the_table_shows_the_witness() -> None:
         **dict.fromkeys(("scenario", "title", "gains", "plant", "certificate", "mode_at_end"), ""),
         **dict.fromkeys(("samples", "duration_s", "seed", "failsafe_events", "late_ticks"), 0),
         **{f"{name}_error_rad": 0.0 for name in ("rms", "max", "final")},
-        "delay": {"true_histogram": {}, "estimated_exact_fraction": None},
+        "delay": {"true_histogram": {}, "estimated_exact_fraction": None, "outside_fraction": None},
         "link": {},
         "witness": numbers,
     }
