@@ -12,7 +12,7 @@ from gains.modelfile import Continuous
 from gains.templates import Template, short_period, with_reference
 from sitl.aircraft.linearised import STATES, Linearised
 
-__all__ = ["held", "model_of", "summary_grid", "summary_of"]
+__all__ = ["held", "model_of", "pole_text", "reference_poles", "summary_grid", "summary_of"]
 
 SENSORS = {"alpha_rad": "AOA_SSA.AOA", "q_rad_s": "ATTITUDE.pitchspeed", "theta_rad": "ATTITUDE.pitch"}
 
@@ -68,11 +68,24 @@ def model_of(
     return model if template is None else with_reference(model, template, bandwidth=bandwidth, damping=damping)
 
 
+def reference_poles(model: Model) -> list[complex]:
+    """Return the reference model's poles in continuous time, 1/s; none without a reference."""
+    if model.reference is None:
+        return []
+    poles = np.log(np.linalg.eigvals(model.reference.Ar).astype(complex)) / model.Ts
+    return sorted(poles.tolist(), key=lambda pole: (abs(pole), pole.imag))
+
+
+def pole_text(poles: list[complex]) -> str:
+    """Return poles as people read them."""
+    return ", ".join(
+        f"{pole.real:.3f}{pole.imag:+.3f}i" if abs(pole.imag) > 1e-9 else f"{pole.real:.3f}" for pole in poles
+    )
+
+
 def summary_of(linearised: Linearised, model: Model) -> dict[str, Any]:
     """Return what people ask of a trim: the numbers of ``sitl linearize --json``."""
     frequency, damping = short_period(model)
-    reference = model.reference
-    poles = [] if reference is None else (np.log(np.linalg.eigvals(reference.Ar).astype(complex)) / model.Ts).tolist()
     return {
         "aircraft": linearised.aircraft,
         "model": model.name,
@@ -86,7 +99,7 @@ def summary_of(linearised: Linearised, model: Model) -> dict[str, Any]:
         "throttle": linearised.throttle,
         "short_period_rad_s": frequency,
         "short_period_damping": damping,
-        "reference_poles": [[pole.real, pole.imag] for pole in poles],
+        "reference_poles": [[pole.real, pole.imag] for pole in reference_poles(model)],
         "notes": list(linearised.notes),
     }
 
@@ -108,9 +121,7 @@ def summary_grid(summary: dict[str, Any], file: str) -> Grid:
         "short period", f"{summary['short_period_rad_s']:.3f} rad/s, damping {summary['short_period_damping']:.3f}"
     )
     if summary["reference_poles"]:
-        poles = ", ".join(
-            f"{re:.3f}{im:+.3f}i" if abs(im) > 1e-9 else f"{re:.3f}" for re, im in summary["reference_poles"]
-        )
+        poles = pole_text([complex(re, im) for re, im in summary["reference_poles"]])
         grid.add_row("reference", f"poles {poles} 1/s")
     for note in summary["notes"]:
         grid.add_row("", note)

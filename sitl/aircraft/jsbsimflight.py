@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 
 from gains.model import Matrix
+from gains.table import InputError
 from sitl.aircraft.jsbsimload import SURFACE, jsbsim_package, trimmed
 
 if TYPE_CHECKING:
@@ -22,6 +23,8 @@ __all__ = ["PROBE_RAD", "Flight", "Hold"]
 
 PROBE_RAD = 0.01
 """How far the elevator is moved each way to see what it does."""
+UNSETTLED = frozenset({"Boeing314"})
+"""Aircraft whose engines find no steady state: FGLinearization would look for it for hours, deaf to Ctrl-C."""
 
 
 @dataclass(slots=True)
@@ -57,6 +60,8 @@ class Flight:
         cls, aircraft: str, vc_kts: float | None, airspeed_m_s: float | None, altitude_m: float, dt_s: float
     ) -> Flight:
         """Load an aircraft, trim it, cut the elevator's wire, and linearise what is left."""
+        if aircraft in UNSETTLED:
+            raise InputError(f"jsbsim:{aircraft}: expected an aircraft whose engines settle, found one whose never do")
         package = jsbsim_package()
         fdm = trimmed(aircraft, vc_kts=vc_kts, airspeed_m_s=airspeed_m_s, altitude_m=altitude_m, dt_s=dt_s)
         surface = fdm[SURFACE]

@@ -14,14 +14,13 @@ everything but the longitudinal loop out of the way.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from gains.model import Matrix, Model
 from gains.table import InputError
-from sitl.aircraft.aerodynamics import Aircraft, load_aircraft, loads
+from sitl.aircraft.aerodynamics import Aircraft, Surfaces, load_aircraft, loads
 from sitl.aircraft.airframe import Pose, Vector
 from sitl.aircraft.atmosphere import GRAVITY, HIGHEST_M, standard_air
 from sitl.aircraft.linearised import STATES
@@ -37,6 +36,7 @@ TRIM_TOLERANCE_RAD = 1e-3
 SLOWEST_M_S = 1.0
 STEEPEST_RAD = math.radians(89.0)
 """Beyond this gamma the wind axes' Euler angles, and beyond this beta Eq. (1), have nothing more to say."""
+NOT_FINITE = "no finite state"
 _STILL = (0.0, 0.0, 0.0)
 
 Triple = tuple[float, float, float]
@@ -95,6 +95,11 @@ def derivatives(aircraft: Aircraft, state: State, controls: Controls, gust: floa
         The w of Eq. (2): a rate of alpha, rad/s. It turns the path against the body, so theta does not feel it.
     air : (u, v, w)
         Velocity of the air in body axes, m/s.
+
+    Raises
+    ------
+    InputError
+        Where there is no standard air: below -1 km and above 20 km.
     """
     V, alpha, beta, gamma, phi, psi, p, q, r, _, _, height, thrust = state
     m, Ix, Iy, Iz, Ixz = aircraft.mass
@@ -141,8 +146,8 @@ def _through(state: State, air: Triple) -> Triple:
     u = V * math.cos(alpha) * math.cos(beta) - air[0]
     v = V * math.sin(beta) - air[1]
     w = V * math.sin(alpha) * math.cos(beta) - air[2]
-    speed = math.sqrt(u * u + v * v + w * w)
-    return speed, math.atan2(w, u), math.asin(v / speed) if speed else 0.0
+    ahead = math.hypot(u, w)
+    return math.hypot(ahead, v), math.atan2(w, u), math.atan2(v, ahead)
 
 
 def integrate(
@@ -235,8 +240,13 @@ class SixDofAirframe:
             along, across, down = self._wind.at(self._k).tolist()
             self._air = (along, across, down)
         for _ in range(self._steps):
-            controls = self._hold.act(state, float(u[0]), self._dt_s)
-            state = integrate(self._aircraft, state, controls, self._dt_s, gust, self._air)
+            controls = self._hold.act(state, _through(state, self._air)[0], float(u[0]), self._dt_s)
+            try:
+                state = integrate(self._aircraft, state, controls, self._dt_s, gust, self._air)
+            except InputError as no_air:  # at the top of the atmosphere, or far beyond its ends, within the step
+                return str(no_air)
+            except (ArithmeticError, ValueError):  # so far off that it has no sine any more
+                return NOT_FINITE
             if (reason := _beyond(state)) is not None:
                 return reason
         self._k += 1
@@ -270,7 +280,7 @@ class SixDofAirframe:
 def _beyond(state: State) -> str | None:
     """Return why an aircraft cannot fly on, if it cannot."""
     if not all(map(math.isfinite, state)):
-        return "no finite state"
+        return NOT_FINITE
     if state.height < 0.0:
         return "ground"
     if state.height > HIGHEST_M:
@@ -282,23 +292,12 @@ def _beyond(state: State) -> str | None:
     return None
 
 
-@dataclass(slots=True)
 class _Hold:
     """Wings level, yaw damped, speed held; gains after the aircraft's own derivatives at trim.
 
     The roll is to be a mode of 1.2 rad/s, critically damped; the yaw rate is damped to 1 / s; the error of the speed
     goes to the thrust with 0.5 rad/s, its integral with a tenth of that.
     """
-
-    aircraft: Aircraft
-    throttle: float
-    _trim_V: float
-    _trim_throttle: float
-    _roll: float
-    _roll_rate: float
-    _yaw_rate: float
-    _speed: float
-    _integral: float = 0.0
 
     ROLL_RAD_S = 1.2
     YAW_PER_S = 1.0
@@ -313,28 +312,33 @@ class _Hold:
         rudder = couple * aero.Cn_rudder / mass.Iz
         roll_damping, yaw_damping = couple * over * aero.Cl_p / mass.Ix, couple * over * aero.Cn_r / mass.Iz
         full = aircraft.thrust_N(1.0, density) / mass.mass
-        self.aircraft = aircraft
+        self._surfaces = aircraft.surfaces
         self.throttle = self._trim_throttle = controls.throttle
         self._trim_V = trim.V
         self._roll = self.ROLL_RAD_S**2 / aileron if aileron else 0.0
         self._roll_rate = max(0.0, 2.0 * self.ROLL_RAD_S + roll_damping) / aileron if aileron else 0.0
         self._yaw_rate = max(0.0, self.YAW_PER_S + yaw_damping) / rudder if rudder else 0.0
         self._speed = self.SPEED_RAD_S / full
-        self._integral = 0.0
+        self._integral = self._aileron = self._rudder = 0.0
 
-    def act(self, state: State, elevator: float, dt_s: float) -> Controls:
+    def act(self, state: State, airspeed: float, elevator: float, dt_s: float) -> Controls:
         """Return all controls for one step of the integration."""
-        surfaces = self.aircraft.surfaces
-        error = self._trim_V - state.V
+        surfaces = self._surfaces
+        error = self._trim_V - airspeed
         wanted = self._trim_throttle + self._speed * (error + 0.1 * self.SPEED_RAD_S * self._integral)
         self.throttle = min(max(wanted, 0.0), 1.0)
         if self.throttle == wanted:  # at its stop it gathers no error
             self._integral += error * dt_s
         aileron = -self._roll * state.phi - self._roll_rate * state.p
         rudder = -self._yaw_rate * state.r
-        return Controls(
-            elevator,
-            min(max(aileron, -surfaces.aileron), surfaces.aileron),
-            min(max(rudder, -surfaces.rudder), surfaces.rudder),
-            self.throttle,
-        )
+        self._aileron = _moved(self._aileron, aileron, surfaces.aileron, surfaces, dt_s)
+        self._rudder = _moved(self._rudder, rudder, surfaces.rudder, surfaces, dt_s)
+        return Controls(elevator, self._aileron, self._rudder, self.throttle)
+
+
+def _moved(position: float, wanted: float, travel: float, surfaces: Surfaces, dt_s: float) -> float:
+    """Return where a surface is after one step: lag, rate and travel."""
+    target = min(max(wanted, -travel), travel)
+    way = (target - position) * -math.expm1(-dt_s / surfaces.tau)
+    most = surfaces.rate * dt_s
+    return position + min(max(way, -most), most)

@@ -39,8 +39,9 @@ def trimmed(
     InputError
         When there is no such flight within the elevator's travel and the engine's power.
     """
-    density = standard_air(altitude_m).density_kg_m3
-    full = aircraft.thrust_N(1.0, density)
+    if not 0.0 < airspeed_m_s < math.inf:
+        raise InputError(f"sixdof:{aircraft.name}: expected a trim at an airspeed above 0, found {airspeed_m_s:g} m/s")
+    full = aircraft.thrust_N(1.0, standard_air(altitude_m).density_kg_m3)
 
     def at(unknown: Matrix) -> tuple[State, Controls]:
         alpha, elevator, throttle = unknown.tolist()

@@ -43,6 +43,8 @@ LOW_FT, HIGH_FT = 1000.0, 2000.0
 """Below the first the low-altitude form holds, above the second the high one; between them both are interpolated."""
 HIGH_SCALE_FT = 1750.0
 LEAST_HEIGHT_FT = 10.0
+LEAST_SPEED_M_S, MOST_SPEED_M_S = 1.0, 2000.0
+"""Between these airspeeds the filters are exact at any altitude and Ts <= 1 s; beyond, their exponentials overflow."""
 
 
 class Wind(Protocol):
@@ -137,7 +139,16 @@ class WindSpec:
             Of the aircraft; the ground is at sea level.
         seed : int
             Of the turbulence; each part draws from a stream of its own.
+
+        Raises
+        ------
+        InputError
+            When the aircraft is too slow or too fast for frozen turbulence.
         """
+        if not LEAST_SPEED_M_S <= airspeed_m_s <= MOST_SPEED_M_S:
+            raise InputError(
+                f"wind: expected an airspeed of {LEAST_SPEED_M_S:g} to {MOST_SPEED_M_S:g} m/s, found {airspeed_m_s:g}"
+            )
         turbulence = tuple(
             Dryden(part, Ts, airspeed_m_s, altitude_m, np.random.default_rng((seed, n)))
             for n, part in enumerate(self.parts)
@@ -241,7 +252,8 @@ def _part(part: str, text: str) -> DrydenSpec | GustSpec:
         if rest in SEVERITIES:
             return DrydenSpec(rest)
         return DrydenSpec(_number(rest, "mps", text, above=0.0))
-    words = rest.partition("@")[0].split(":")
+    way, at, start = rest.partition("@")
+    words = way.split(":")
     if kind != "gust" or len(words) != 3 or words[0] not in AXES:
         known = ", ".join(SEVERITIES)
         raise InputError(
@@ -249,8 +261,7 @@ def _part(part: str, text: str) -> DrydenSpec | GustSpec:
             f" found {part or 'nothing'}"
         )
     speed, length = _number(words[1], "mps", text), _number(words[2], "m", text, above=0.0)
-    start = rest.partition("@")[2]
-    return GustSpec(words[0], speed, length, parse_time_ns(start, f'wind "{text}"') if start else 0)
+    return GustSpec(words[0], speed, length, parse_time_ns(start, f'wind "{text}"') if at else 0)
 
 
 def _number(word: str, unit: str, text: str, *, above: float = -math.inf) -> float:

@@ -3,19 +3,24 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import click
-import numpy as np
 
-from gains.command import FiniteRange, print_json
+from gains.command import FiniteRange, print_json, require_writable
 from gains.table import InputError
 from gains.templates import DAMPING, TEMPLATES, Template
 from sitl.commands.options import FILE
 
+if TYPE_CHECKING:
+    from gains.model import Model
+    from sitl.aircraft.linearised import Linearised
+
 __all__ = ["linearize"]
 
 FOOT = 0.3048
+LOWEST_M, HIGHEST_M = -500.0, 80e3
+"""Where there is air to fly in: from the Dead Sea to where the tables of the atmosphere end."""
 _POSITIVE = FiniteRange(0.0, min_open=True)
 
 
@@ -62,11 +67,13 @@ def linearize(
     """
     if as_json and output is None:
         raise InputError("--json: expected -o FILE, too: standard output cannot hold both")
+    if output is not None:
+        require_writable(output)  # before it is computed
+    altitude = _altitude(altitude_ft, altitude_m)
     from sitl.linearizing import held, model_of, summary_grid, summary_of  # with what is slow to load
 
-    altitude = _altitude(altitude_ft, altitude_m)
     linearised = _linearised(aircraft, vc_kts, tas_m_s, mach, altitude)
-    called = name or (output.stem if output is not None else aircraft.partition(":")[2])
+    called = name or (output or Path(aircraft.partition(":")[2])).name.removesuffix(".toml")
     chosen: Template | None = next((known for known in TEMPLATES if known == template), None)
     model = model_of(linearised, called, ts_ms / 1000.0, chosen, bandwidth, damping)
     from gains.modelfile import model_text, save_model
@@ -87,15 +94,20 @@ def linearize(
 def _altitude(altitude_ft: float | None, altitude_m: float | None) -> float:
     if (altitude_ft is None) == (altitude_m is None):
         raise InputError("--altitude-ft, --altitude-m: expected one of them")
-    if altitude_m is not None:
-        return altitude_m
-    assert altitude_ft is not None
-    return altitude_ft * FOOT
+    altitude = altitude_m if altitude_ft is None else altitude_ft * FOOT
+    assert altitude is not None
+    if not LOWEST_M <= altitude <= HIGHEST_M:
+        option, unit = ("--altitude-m", 1.0) if altitude_ft is None else ("--altitude-ft", FOOT)
+        raise InputError(
+            f"{option}: expected a number from {LOWEST_M / unit:.0f} to {HIGHEST_M / unit:.0f},"
+            f" found {altitude / unit:g}"
+        )
+    return altitude
 
 
 def _linearised(
     aircraft: str, vc_kts: float | None, tas_m_s: float | None, mach: float | None, altitude_m: float
-) -> Any:
+) -> Linearised:
     """Return what the maker of this kind of aircraft says of it."""
     kind, colon, name = aircraft.partition(":")
     speeds = {"--vc-kts": vc_kts, "--tas-m-s": tas_m_s, "--mach": mach}
@@ -114,8 +126,10 @@ def _linearised(
     return linearise_sixdof(name, mach=mach, airspeed_m_s=tas_m_s, altitude_m=altitude_m)
 
 
-def _notes(linearised: Any, model: Any, template: Template | None) -> list[str]:
+def _notes(linearised: Linearised, model: Model, template: Template | None) -> list[str]:
     """Return the comment at the head of the file."""
+    from sitl.linearizing import pole_text, reference_poles
+
     notes = [
         f"{linearised.aircraft} near level flight at {linearised.airspeed_m_s:.2f} m/s true and"
         f" {linearised.altitude_m:.0f} m, made by sitl linearize.",
@@ -125,8 +139,6 @@ def _notes(linearised: Any, model: Any, template: Template | None) -> list[str]:
         f"Units: x = [alpha (rad), q (rad/s), theta (rad)], u = elevator ({linearised.u_unit}),"
         " w = gust as a rate of alpha (rad/s).",
     ]
-    if template is not None and model.reference is not None:
-        poles = np.log(np.linalg.eigvals(model.reference.Ar).astype(complex)) / model.Ts
-        shown = ", ".join(f"{p.real:.3f}{p.imag:+.3f}i" if abs(p.imag) > 1e-9 else f"{p.real:.3f}" for p in poles)
-        notes.append(f"Reference: template {template}, poles {shown} 1/s; discrete at Ts.")
+    if template is not None:
+        notes.append(f"Reference: template {template}, poles {pole_text(reference_poles(model))} 1/s; discrete at Ts.")
     return notes
