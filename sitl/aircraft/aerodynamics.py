@@ -1,8 +1,9 @@
 """An aircraft by its derivatives: what its parameter file says, and the forces and moments that follow.
 
 Coefficients are linear in angles, rates and surfaces but for the induced drag. Lift and drag act in stability axes of
-the moving air, the moments about the body axes; rates are made dimensionless with b/2V and c/2V. Signs: elevator trailing edge down pitches down; aileron positive rolls
-right; rudder positive (trailing edge left) yaws left. Stored aircraft lie in ``sitl/airframes``.
+the moving air, the moments about the body axes; rates are made dimensionless with b/2V and c/2V. Signs: elevator
+trailing edge down pitches down; aileron positive rolls right; rudder positive (trailing edge left) yaws left. Stored
+aircraft lie in ``sitl/airframes``.
 """
 
 from __future__ import annotations

@@ -158,7 +158,7 @@ def test_a_flight_ends_well_and_says_so_in_one_json_object(watched: Flight) -> N
         *("scenario", "seed", "virtual", "duration_s", "samples", "diverged", "rms_error_rad", "max_error_rad"),
         *("delay", "link", "failsafe_events", "late_ticks", "files"),
     } <= watched.summary.keys()
-    fractions = {f"{what}_fraction" for what in ("estimated_exact", "within_one", "covered", "unknown")}
+    fractions = {f"{what}_fraction" for what in ("estimated_exact", "within_one", "covered", "unknown", "outside")}
     assert watched.summary["delay"].keys() == {"true_histogram", *fractions}
     for way in ("up", "down"):
         assert watched.summary["link"][way].keys() == {"sent", "delivered", "lost", "duplicated", "reordered"}
