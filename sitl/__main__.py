@@ -15,11 +15,14 @@ from gains.command import run, version
 __all__ = ["main"]
 
 COMMANDS = {
+    "adversary": "sitl.commands.adversary:adversary",
+    "campaign": "sitl.commands.campaign:campaign",
     "fly": "sitl.commands.fly:fly_command",
     "linearize": "sitl.commands.linearize:linearize",
     "links": "sitl.commands.links:links",
     "live": "sitl.commands.live:live",
     "plant": "sitl.commands.plant:plant",
+    "rare": "sitl.commands.rare:rare",
     "recover": "sitl.commands.recover:recover_command",
     "relay": "sitl.commands.relay:relay",
     "report": "sitl.commands.report:report",

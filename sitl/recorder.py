@@ -9,11 +9,11 @@ A full disk ends the files and not the flight: what they lack is counted and tol
 
 from __future__ import annotations
 
-import base64
 import contextlib
 import errno
 import os
 import sys
+from binascii import a2b_base64
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import MappingProxyType
@@ -100,7 +100,7 @@ class FlightRecorder:
         if record.topic.startswith("mavlink/"):
             if self._tlog is not None and record.topic == self._tlog_topic:
                 time_us = self._unix_us + log_time_ns // NS_PER_US
-                for frame in split_frames(base64.b64decode(record.body["frame"]))[0]:
+                for frame in split_frames(a2b_base64(record.body["frame"]))[0]:
                     self._tlog.write(frame, time_us)
         elif len(self.kept) < MAX_KEPT:
             self.kept.append((sys.intern(record.topic), log_time_ns, record.body))

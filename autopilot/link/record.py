@@ -11,19 +11,19 @@ Each finished chunk goes to the operating system in one write, at the latest whe
 
 from __future__ import annotations
 
-import base64
 import errno
 import os
+from binascii import b2a_base64
 from collections.abc import Iterator, Mapping
 from io import FileIO
 from types import MappingProxyType
-from typing import IO, Any, Self, cast
+from typing import Any, Self
 
 import numpy as np
 import orjson
 from mcap.reader import make_reader
-from mcap.writer import CompressionType, Writer
 
+from autopilot.link.mcapfile import McapWriter
 from autopilot.link.node import Record
 from autopilot.link.topics import FRAME_SCHEMA, SCHEMAS, is_topic, schema_of
 
@@ -62,7 +62,7 @@ _JSON_OPTIONS = orjson.OPT_SERIALIZE_NUMPY
 
 def frame_record(port: str, t_ns: int, direction: str, datagram: bytes) -> Record:
     """Return the record of one datagram at a port; ``direction`` is ``sent`` or ``received``."""
-    body = {"t_ns": t_ns, "direction": direction, "frame": base64.b64encode(datagram).decode("ascii")}
+    body = {"t_ns": t_ns, "direction": direction, "frame": b2a_base64(datagram, newline=False).decode("ascii")}
     return Record(f"mavlink/{port}", t_ns, body)
 
 
@@ -127,20 +127,11 @@ class _File:
     def __init__(self, path: str | os.PathLike[str]):
         self._raw = FileIO(path, "w")
         self._pending = bytearray()
-        self._length = 0
         self._full = False
         self.error = ""
 
-    def write(self, data: bytes) -> int:
+    def write(self, data: bytes) -> None:
         self._pending += data
-        self._length += len(data)
-        return len(data)
-
-    def tell(self) -> int:
-        return self._length
-
-    def flush(self) -> None:
-        """Do nothing: ``drain`` decides when bytes leave."""
 
     @property
     def pending(self) -> int:
@@ -217,14 +208,13 @@ class McapRecorder:
         self._channels: dict[str, int] = {}
         self._unsaved = 0
         self._chunk_start_ns = 0
-        self._writer = Writer(cast("IO[bytes]", self._file), chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)
-        self._writer.start(profile=_PROFILE, library=_PROFILE)
-        self._writer.add_metadata(METADATA_NAME, dict(metadata))
+        self._writer = McapWriter(self._file, _PROFILE, _PROFILE, CHUNK_BYTES)
+        self._writer.add_metadata(METADATA_NAME, metadata)
         if not self._file.drain():
             self._file.close()
             raise OSError(self._file.error)
         for name, content in attachments.items():  # at time 0: nothing of the wall clock
-            self._writer.add_attachment(0, 0, name, ATTACHMENT_TYPE, content)
+            self._writer.add_attachment(name, ATTACHMENT_TYPE, content)
         self._file.drain()  # a disk that is full by now ends the recording, not the flight
 
     @property
@@ -256,11 +246,11 @@ class McapRecorder:
         if not self._unsaved:
             self._chunk_start_ns = log_time_ns
         self._unsaved += 1
-        data = orjson.dumps(record.body, default=_plain, option=_JSON_OPTIONS)
-        self._writer.add_message(channel, log_time_ns, data, log_time_ns)
-        if not self._file.pending and log_time_ns - self._chunk_start_ns >= MAX_CHUNK_NS:
-            self._writer.flush()  # type: ignore[no-untyped-call]
-        if self._file.pending:
+        data = orjson.dumps(record.body, _plain, _JSON_OPTIONS)
+        written = self._writer.add_message(channel, log_time_ns, data)
+        if not written and log_time_ns - self._chunk_start_ns >= MAX_CHUNK_NS:
+            written = self._writer.flush()
+        if written:
             self._drain()
 
     def fill_disk(self) -> None:
@@ -273,7 +263,7 @@ class McapRecorder:
             return
         self._closed = True
         if not self._file.error:
-            self._writer.finish()  # type: ignore[no-untyped-call]
+            self._writer.finish()
             self._drain()
         self._file.close()
 
@@ -290,7 +280,7 @@ class McapRecorder:
             return None
         text = orjson.dumps(dict(schema))
         name = "mavlink/datagram" if schema is FRAME_SCHEMA else topic
-        channel = self._writer.register_channel(topic, "json", self._writer.register_schema(name, "jsonschema", text))
+        channel = self._writer.register(topic, "json", name, "jsonschema", text)
         self._channels[topic] = channel
         if self._file.pending:
             self._drain()  # the schema filled the chunk; the next message opens another

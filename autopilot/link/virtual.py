@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import StrEnum
 
 from autopilot.link.clock import Clock
@@ -22,6 +22,8 @@ __all__ = ["MAX_WAITING", "Loss", "Participant", "VirtualNetwork"]
 MAX_WAITING = 256
 """Datagrams that wait for a frozen node unless it says otherwise: small ones in a socket buffer of 208 KiB, as Linux
 has it by default."""
+
+_NEVER_NS = 1 << 63
 
 Sink = Callable[[Record, int], None]
 """Takes a record and the true time at which it was made."""
@@ -60,10 +62,32 @@ class Participant:
     max_waiting: int = MAX_WAITING
 
 
-@dataclass(slots=True)
-class _State:
-    """What has been done to a node; the first two keep it from anything."""
+@dataclass(slots=True, eq=False)
+class _Seat:
+    """A node's place in the network, and what has been done to it; dead or frozen, it is kept from anything.
 
+    Attributes
+    ----------
+    participant : Participant
+        Who sits there now.
+    tapped : bool
+        Whether the tap sees its datagrams.
+    wires : dict
+        The seat and the port at the other end, by port.
+    waiting : deque of (port, payload)
+        What has come, and was not taken yet.
+    deadline_ns : int or None
+        Of the node, by its own clock.
+    due_ns : int
+        The same in true time; ``_NEVER_NS`` without one.
+    """
+
+    participant: Participant
+    tapped: bool
+    wires: dict[str, tuple[_Seat, str]] = field(default_factory=dict)
+    waiting: deque[Datagram] = field(default_factory=deque)
+    deadline_ns: int | None = None
+    due_ns: int = _NEVER_NS
     dead: bool = False
     frozen: bool = False
     mute: bool = False
@@ -107,51 +131,50 @@ class VirtualNetwork:
         self._wires = {(self._index[a], port): (self._index[b], far) for (a, port), (b, far) in wires.items()}
         self._sink = sink
         self._tap = tap
-        self._tapped = [p.name in tapped and tap is not None for p in self._participants]
-        self._deliveries: list[deque[tuple[str, bytes]]] = [deque() for _ in self._participants]
-        self._deadlines: list[int | None] = [None] * len(self._participants)
-        self._due: list[int | None] = [None] * len(self._participants)
-        self._states = [_State() for _ in self._participants]
+        self._seats = [_Seat(p, p.name in tapped and tap is not None) for p in self._participants]
+        for (i, port), (far, far_port) in self._wires.items():
+            self._seats[i].wires[port] = (self._seats[far], far_port)
         self.losses: dict[str, Counter[Loss]] = {p.name: Counter() for p in self._participants}
-        for i in range(len(self._participants)):
-            self._schedule(i)
+        for seat in self._seats:
+            self._reschedule(seat)
 
     # What may happen to a node
 
     def replace(self, name: str, node: Node, clock: Clock) -> None:
         """Boot a new node under an old name: it takes what waits for a frozen one; of a dead one nothing waits."""
-        i = self._index[name]
-        self._participants[i] = Participant(name, node, clock, self._participants[i].max_waiting)
-        self._states[i] = _State()
-        self._schedule(i, anew=True)
+        i, seat = self._index[name], self._seat(name)
+        seat.participant = Participant(name, node, clock, seat.participant.max_waiting)
+        self._participants[i] = seat.participant
+        seat.dead = seat.frozen = seat.mute = False
+        self._reschedule(seat)
 
     def kill(self, name: str) -> None:
         """Let a node die: what waited for it is lost, and what comes, until it is replaced."""
-        i = self._index[name]
-        self._states[i].dead = True
-        self.losses[name][Loss.DEAD] += len(self._deliveries[i])
-        self._deliveries[i].clear()
-        self._schedule(i, anew=True)
+        seat = self._seat(name)
+        seat.dead = True
+        self.losses[name][Loss.DEAD] += len(seat.waiting)
+        seat.waiting.clear()
+        self._reschedule(seat)
 
     def freeze(self, name: str) -> None:
         """Let a node stand still: what comes waits, as far as there is room, and so does what is due."""
-        i = self._index[name]
-        self._states[i].frozen = True
-        self._schedule(i, anew=True)
+        seat = self._seat(name)
+        seat.frozen = True
+        self._reschedule(seat)
 
     def thaw(self, name: str) -> None:
         """Let a frozen node go on: it takes all that waits, and then does all that is due."""
-        i = self._index[name]
-        self._states[i].frozen = False
-        self._schedule(i, anew=True)
+        seat = self._seat(name)
+        seat.frozen = False
+        self._reschedule(seat)
 
     def mute(self, name: str, active: bool) -> None:
         """Let all that a node sends get lost, or no longer so."""
-        self._states[self._index[name]].mute = active
+        self._seat(name).mute = active
 
     def clock(self, name: str) -> Clock:
         """Return a node's clock as it runs now."""
-        return self._participants[self._index[name]].clock
+        return self._seat(name).participant.clock
 
     def step_clock(self, name: str, by_ns: int) -> None:
         """Set a node's clock forward, or back."""
@@ -163,9 +186,12 @@ class VirtualNetwork:
         self._set_clock(name, Clock(self.clock(name).node_ns(self.now_ns), drift_ppb, self.now_ns))
 
     def _set_clock(self, name: str, clock: Clock) -> None:
-        i = self._index[name]
-        self._participants[i].clock = clock
-        self._schedule(i, anew=True)
+        seat = self._seat(name)
+        seat.participant.clock = clock
+        self._reschedule(seat)
+
+    def _seat(self, name: str) -> _Seat:
+        return self._seats[self._index[name]]
 
     # Events
 
@@ -175,83 +201,84 @@ class VirtualNetwork:
             self._deliver()
             if until():
                 return
-            i = self._earliest()
-            due_ns = self._due[i]
-            if due_ns is None or due_ns > limit_ns:
+            seat = self._earliest()
+            due_ns = seat.due_ns
+            if due_ns > limit_ns:
                 self.now_ns = max(self.now_ns, limit_ns)
                 return
-            self.now_ns = max(self.now_ns, due_ns)
-            p = self._participants[i]
+            if due_ns > self.now_ns:
+                self.now_ns = due_ns
+            p = seat.participant
             p.node.tick(p.clock.node_ns(self.now_ns))
-            self._collect(i)
+            self._collect(seat)
 
     def _deliver(self) -> None:
         """Hand over what is under way, always to the first node that has something; wires take no time."""
-        i, count = 0, len(self._participants)
-        while i < count:
-            waiting = self._deliveries[i]
-            if not waiting or self._states[i].frozen:
+        seats, i = self._seats, 0
+        while i < len(seats):
+            seat = seats[i]
+            waiting = seat.waiting
+            if not waiting or seat.frozen:
                 i += 1
                 continue
-            p = self._participants[i]
+            p = seat.participant
             receive, now_ns = p.node.receive, p.clock.node_ns(self.now_ns)
             while waiting:
                 port, datagram = waiting.popleft()
-                if self._tapped[i]:
+                if seat.tapped:
                     self._tap(p.name, port, "received", datagram, self.now_ns)  # type: ignore[misc]
                 receive(port, datagram, now_ns)
-            if self._collect(i):
+            if self._collect(seat):
                 i = 0
 
-    def _deliver_to(self, i: int, port: str, datagram: bytes) -> None:
+    def _deliver_to(self, seat: _Seat, port: str, datagram: bytes) -> None:
         """Put a datagram before a node, if there is one, and room."""
-        state, waiting = self._states[i], self._deliveries[i]
-        if state.dead:
-            self.losses[self._participants[i].name][Loss.DEAD] += 1
-        elif state.frozen and len(waiting) >= self._participants[i].max_waiting:
-            self.losses[self._participants[i].name][Loss.OVERFLOW] += 1
+        if seat.dead:
+            self.losses[seat.participant.name][Loss.DEAD] += 1
+        elif seat.frozen and len(seat.waiting) >= seat.participant.max_waiting:
+            self.losses[seat.participant.name][Loss.OVERFLOW] += 1
         else:
-            waiting.append((port, datagram))
+            seat.waiting.append((port, datagram))
 
-    def _earliest(self) -> int:
-        """Return the node whose tick is due first, the first of equals."""
-        earliest, first_ns, now_ns = 0, None, self.now_ns
-        for i, due_ns in enumerate(self._due):
-            if due_ns is not None and (first_ns is None or due_ns < first_ns):
-                earliest, first_ns = i, due_ns
-                if due_ns <= now_ns:
-                    break  # what is overdue is due now, and of equals the first counts
+    def _earliest(self) -> _Seat:
+        """Return the seat whose tick is due first, the first of equals."""
+        earliest = self._seats[0]
+        for seat in self._seats:
+            if seat.due_ns < earliest.due_ns:
+                earliest = seat
+            if earliest.due_ns <= self.now_ns:
+                break  # what is overdue is due now, and of equals the first counts
         return earliest
 
-    def _schedule(self, i: int, *, anew: bool = False) -> None:
-        """Ask a node for its deadline, and map it to true time when it is a new one, or the node or its clock is."""
-        p, state = self._participants[i], self._states[i]
-        deadline_ns = None if state.dead or state.frozen else p.node.next_deadline_ns()
-        if deadline_ns != self._deadlines[i] or anew:
-            self._deadlines[i] = deadline_ns
-            self._due[i] = None if deadline_ns is None else p.clock.true_ns(deadline_ns)
+    def _reschedule(self, seat: _Seat) -> None:
+        """Ask for a deadline anew, as the node, its clock or what has been done to it is another."""
+        p = seat.participant
+        seat.deadline_ns = None if seat.dead or seat.frozen else p.node.next_deadline_ns()
+        seat.due_ns = _NEVER_NS if seat.deadline_ns is None else p.clock.true_ns(seat.deadline_ns)
 
-    def _collect(self, i: int) -> bool:
+    def _collect(self, seat: _Seat) -> bool:
         """Take what a node has sent and recorded, and its new deadline; return whether it sent anything."""
-        p = self._participants[i]
-        outgoing = p.node.outgoing()
+        p = seat.participant
+        node = p.node
+        outgoing = node.outgoing()
         if outgoing:
-            self._send(i, p, outgoing)
-        records = p.node.records()
+            self._send(seat, outgoing)
+        records = node.records()
         if self._sink is not None:
             for record in records:
                 self._sink(record, p.clock.true_ns(record.t_ns))
-        self._schedule(i)
+        if node.next_deadline_ns() != seat.deadline_ns:
+            self._reschedule(seat)
         return bool(outgoing)
 
-    def _send(self, i: int, p: Participant, outgoing: Sequence[Datagram]) -> None:
+    def _send(self, seat: _Seat, outgoing: Sequence[Datagram]) -> None:
         """Put what a node has sent before those at the other ends."""
-        if self._states[i].mute:
-            self.losses[p.name][Loss.MUTE] += len(outgoing)
+        if seat.mute:
+            self.losses[seat.participant.name][Loss.MUTE] += len(outgoing)
             return
         for port, datagram in outgoing:
-            if self._tapped[i]:
-                self._tap(p.name, port, "sent", datagram, self.now_ns)  # type: ignore[misc]
-            far = self._wires.get((i, port))
+            if seat.tapped:
+                self._tap(seat.participant.name, port, "sent", datagram, self.now_ns)  # type: ignore[misc]
+            far = seat.wires.get(port)
             if far is not None:
                 self._deliver_to(far[0], far[1], datagram)

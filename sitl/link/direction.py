@@ -32,6 +32,7 @@ LATEST = 1024
 
 _NEVER_NS = 1 << 62
 _PERFECT = LinkSpec()
+_DELIVERED = Fate.DELIVERED  # asked for with each packet, and found slowly in its enumeration
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,7 +103,7 @@ class Counters:
 
     def count(self, fate: Fate, size: int, late: bool) -> None:
         """Count a copy of this many bytes by its fate; ``late`` if it left after one that had entered later."""
-        if fate is Fate.DELIVERED:
+        if fate is _DELIVERED:
             self.delivered += 1
             self.bytes += size
             self.reordered += late
@@ -228,7 +229,9 @@ class Direction:
 
     def lane(self, datagram: bytes) -> Lane:
         """Return what a packet meets."""
-        index = None if self._find is None else self._find(datagram)
+        if self._find is None:
+            return self.main
+        index = self._find(datagram)
         return self.main if index is None else self.rules[index]
 
     def order(self, change: Change) -> None:
@@ -247,9 +250,11 @@ class Direction:
 
     def delivered(self, now_ns: int, size: int, entered_ns: int, exit_ns: int | None) -> None:
         """Note a delivery now, and how precise it was: it was to leave at ``exit_ns``; None when the gate chose."""
+        requested_ns = None
         if exit_ns is not None:
             self.errors.add(now_ns - exit_ns)
-        self.latest.append((now_ns, size, None if exit_ns is None else exit_ns - entered_ns, now_ns - entered_ns))
+            requested_ns = exit_ns - entered_ns
+        self.latest.append((now_ns, size, requested_ns, now_ns - entered_ns))
 
     def spec_at(self, link_ns: int) -> LinkSpec:
         """Return the SPEC that holds at this time, not before the present."""

@@ -180,6 +180,8 @@ class Copy(NamedTuple):
     flipped: tuple[int, ...] = ()
 
 
+_DELIVERED = Fate.DELIVERED  # asked for with each packet, and found slowly in its enumeration
+
 _Draw: TypeAlias = tuple[bool, int, tuple[int, ...]]
 """What chance has for one copy: whether it would overtake, its delay and jitter (ns), and the bits that are flipped.
 
@@ -201,6 +203,11 @@ def _draws(
         return overtakes, flight_ns, () if corruption is None else _flips(corruption, corrupt, size_bytes)
 
     return draw
+
+
+def _losses(loss: float | Loss, rng: np.random.Generator) -> Callable[[], bool]:
+    """Return a source that says of each packet whether it is lost."""
+    return loss.sampler(rng) if isinstance(loss, Loss) else memoryless(loss, rng)
 
 
 def _flips(corruption: Corruption, rng: np.random.Generator, size_bytes: int) -> tuple[int, ...]:
@@ -230,7 +237,7 @@ class Impairment:
         self.spec = spec
         loss, dup, *rest = rng.spawn(6)
         *corrupt, fading, fading_loss, handover = rng.spawn(5)
-        self._lost = spec.loss.sampler(loss) if isinstance(spec.loss, Loss) else memoryless(spec.loss, loss)
+        self._lost = None if spec.loss == 0.0 else _losses(spec.loss, loss)
         self._dup = dup.random if spec.dup > 0.0 else None
         self._first, self._second = (_draws(spec, rest[n], rest[2 + n], corrupt[n]) for n in range(2))
         self._bad_at = None if spec.fading is None else spec.fading.process(fading)
@@ -301,7 +308,8 @@ class Impairment:
             One, or two if it was duplicated. A copy in flight that meets a blackout has the instant at
             which it would have left: until then it is in the queue.
         """
-        lost, draw = self._lost(), self._first(size_bytes)
+        lost = self._lost is not None and self._lost()
+        draw = self._first(size_bytes)
         further: _Draw | None = None
         if self._dup is not None:
             twice, second = self._dup() < self.spec.dup, self._second(size_bytes)
@@ -356,7 +364,7 @@ class Impairment:
         elif self._keep_order:
             exit_ns = self._last_exit_ns
         out = self._blackouts and self.spec.is_out(exit_ns)
-        return Copy(Fate.BLACKOUT if out else Fate.DELIVERED, exit_ns, flipped)
+        return Copy(Fate.BLACKOUT if out else _DELIVERED, exit_ns, flipped)
 
     def _serialise(self, size_bytes: int, now_ns: int) -> int | None:
         """Return when a copy that may be sent from now on has been sent; None when no time ever is free."""

@@ -22,7 +22,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from heapq import heappop, heappush
-from typing import Any, NamedTuple
+from typing import Any, TypeAlias
 
 from autopilot.link.clock import NS_PER_S
 from autopilot.link.node import Datagram, Record
@@ -72,19 +72,15 @@ class Outbox:
         return True
 
 
-class _Packet(NamedTuple):
-    """One copy of a packet, ordered by exit, then entry; ``sequence`` is unique: no more is compared."""
+_Packet: TypeAlias = tuple[int, int, Direction, Lane, int, int, int, Fate, tuple[int, ...], bytes]
+"""One copy of a packet: when it leaves, sequence, direction, lane, number of the packet, of the copy, when it entered,
+fate, flipped bits, payload; times are link time.
 
-    exit_ns: int
-    sequence: int
-    direction: Direction
-    lane: Lane
-    number: int
-    copy: int
-    entered_ns: int
-    fate: Fate
-    flipped: tuple[int, ...]
-    payload: bytes
+Ordered by exit, then entry; ``sequence`` is unique: no more is compared. A plain tuple, which is unpacked where it is
+looked at, since there is one per packet: with names it would take several times as long to make and to read.
+"""
+
+_DELIVERED = Fate.DELIVERED  # asked for with each packet, and found slowly in its enumeration
 
 
 class Link:
@@ -145,7 +141,7 @@ class Link:
 
     def next_deadline_ns(self) -> int | None:
         """Return when the next packet leaves, by the node's clock, or None."""
-        return self._origin_ns + self._heap[0].exit_ns if self._heap else None
+        return self._origin_ns + self._heap[0][0] if self._heap else None
 
     def link_ns(self, now_ns: int) -> int:
         """Return the link time at which it is ``now_ns`` by the node's clock; 0 before the first packet."""
@@ -162,13 +158,14 @@ class Link:
             change = direction.change()
             if not change.live:
                 self._tell(change, self._origin_ns + self._newest_ns)
-        lane, counters = direction.lane(datagram), direction.counters
+        lane = direction.lane(datagram) if direction.rules else direction.main
+        counters = direction.counters
         counters.sent += 1
         if lane.counters is not None:
             lane.counters.sent += 1
         number = counters.sent
         if lane.passes and lane.queued < lane.limit:
-            copies: tuple[Copy, ...] = (Copy(Fate.DELIVERED, link_ns),)
+            copies: tuple[Copy, ...] = (Copy(_DELIVERED, link_ns),)
         else:
             copies = lane.impairment.step(len(datagram), link_ns, lane.queued)
         for copy, (fate, exit_ns, flipped) in enumerate(copies):
@@ -176,8 +173,8 @@ class Link:
                 _count_further(direction, lane)
             self._sequence += 1
             payload = flip(datagram, flipped) if flipped else datagram
-            packet = _Packet(exit_ns, self._sequence, direction, lane, number, copy, link_ns, fate, flipped, payload)
-            if exit_ns > self._newest_ns or (self._stamped and fate is Fate.DELIVERED):
+            packet = (exit_ns, self._sequence, direction, lane, number, copy, link_ns, fate, flipped, payload)
+            if exit_ns > self._newest_ns or (self._stamped and fate is _DELIVERED):
                 direction.queued += 1
                 lane.queued += 1
                 heappush(self._heap, packet)
@@ -188,7 +185,8 @@ class Link:
         """Let out what is due; of a stamped link no more than ``MAX_AT_ONCE`` copies, so that it stays due."""
         if self._begun:
             self._pass_to(now_ns)
-            self._release(MAX_AT_ONCE if self._stamped else None)
+            if self._heap and self._heap[0][0] <= self._newest_ns:
+                self._release(MAX_AT_ONCE if self._stamped else None)
 
     def order(self, specs: Mapping[Way, LinkSpec], now_ns: int) -> list[Change]:
         """Change directions from now on, after every packet that has entered; return the changes.
@@ -222,13 +220,14 @@ class Link:
             if link_ns != self._newest_ns:
                 self._pass_to(now_ns)
                 link_ns = self._newest_ns
-            if self._heap:
+            if self._heap and self._heap[0][0] <= link_ns:
                 self._release()
         elif link_ns < direction.came_ns:
             self._set_back(direction.came_ns - link_ns)
             link_ns = direction.came_ns
         direction.came_ns = link_ns
-        link_ns = max(0, link_ns)  # what came before the first of the other direction may be read after it
+        if link_ns < 0:  # what came before the first of the other direction may be read after it
+            link_ns = 0
         direction.entered_ns = link_ns
         if link_ns > self._newest_ns:
             self._newest_ns = link_ns
@@ -265,12 +264,12 @@ class Link:
     def _release(self, most: int | None = None) -> None:
         """Let out what is due, or the first so many copies of it."""
         heap, now_ns, left = self._heap, self._newest_ns, most
-        while heap and heap[0].exit_ns <= now_ns and left != 0:
+        while heap and heap[0][0] <= now_ns and left != 0:
             if left is not None:
                 left -= 1
             packet = heappop(heap)
-            packet.direction.queued -= 1
-            packet.lane.queued -= 1
+            packet[2].queued -= 1
+            packet[3].queued -= 1
             if self.gate is None:
                 self._conclude(packet)
             else:
@@ -278,11 +277,12 @@ class Link:
 
     def _settle(self, packet: _Packet) -> None:
         """Let a copy meet its fate now; a command that would leave goes to the gate instead."""
-        if self.gate is not None and packet.direction is self.down and packet.fate is Fate.DELIVERED:
-            step = self.gate.command(packet.payload, packet)
+        _, _, direction, lane, _, _, _, fate, _, payload = packet
+        if self.gate is not None and direction is self.down and fate is _DELIVERED:
+            step = self.gate.command(payload, packet)
             if step is not None:
-                packet.direction.queued += 1  # until the gate lets go of it, which may be at once
-                packet.lane.queued += 1
+                direction.queued += 1  # until the gate lets go of it, which may be at once
+                lane.queued += 1
                 self._obey(step)
                 return
         self._conclude(packet)
@@ -290,57 +290,63 @@ class Link:
     def _obey(self, step: GateStep[_Packet]) -> None:
         """Do what the gate decided. A command that goes to the plant again is a further copy."""
         for packet, times in step.released:
+            exit_ns, sequence, direction, lane, number, copy, entered_ns, fate, flipped, payload = packet
             if times:
-                _count_further(packet.direction, packet.lane)
+                _count_further(direction, lane)
+                copy += times
             else:
-                packet.direction.queued -= 1
-                packet.lane.queued -= 1
-            self._conclude(packet._replace(copy=packet.copy + times), timed=True)
-        for packet in step.dropped:
-            packet.direction.queued -= 1
-            packet.lane.queued -= 1
-            self._conclude(packet._replace(fate=Fate.GATED), timed=True)
+                direction.queued -= 1
+                lane.queued -= 1
+            again = (exit_ns, sequence, direction, lane, number, copy, entered_ns, fate, flipped, payload)
+            self._conclude(again, timed=True)
+        for exit_ns, sequence, direction, lane, number, copy, entered_ns, _, flipped, payload in step.dropped:
+            direction.queued -= 1
+            lane.queued -= 1
+            gated = (exit_ns, sequence, direction, lane, number, copy, entered_ns, Fate.GATED, flipped, payload)
+            self._conclude(gated, timed=True)
 
     def _conclude(self, packet: _Packet, *, timed: bool = False) -> None:
         """Count and record a copy whose fate is fulfilled now; send it if that is delivery.
 
         ``timed`` says that the gate chose the time, so it tells nothing about precision.
         """
-        direction, lane, now_ns = packet.direction, packet.lane, self._newest_ns
-        late = packet.number < direction.newest
-        direction.counters.count(packet.fate, len(packet.payload), late)
+        exit_ns, _, direction, lane, number, _, entered_ns, fate, _, payload = packet
+        now_ns, outbox, size = self._newest_ns, self._outbox, len(payload)
+        late = number < direction.newest
+        direction.counters.count(fate, size, late)
         if lane.counters is not None:
-            lane.counters.count(packet.fate, len(packet.payload), late)
-        if packet.fate is Fate.DELIVERED:
+            lane.counters.count(fate, size, late)
+        if fate is _DELIVERED:
             if not late:
-                direction.newest = packet.number
-            self._outbox.outgoing.append((direction.exit_port, packet.payload))
-            direction.delivered(now_ns, len(packet.payload), packet.entered_ns, None if timed else packet.exit_ns)
+                direction.newest = number
+            outbox.outgoing.append((direction.exit_port, payload))
+            direction.delivered(now_ns, size, entered_ns, None if timed else exit_ns)
         t_ns = self._origin_ns + now_ns
-        if self._outbox.may_log(t_ns):
-            self._outbox.records.append(Record(direction.topic, t_ns, self._body(packet)))
+        if outbox.may_log(t_ns):
+            outbox.records.append(Record(direction.topic, t_ns, self._body(packet)))
         else:
             direction.counters.unlogged += 1
-            if packet.lane.counters is not None:
-                packet.lane.counters.unlogged += 1
+            if lane.counters is not None:
+                lane.counters.unlogged += 1
 
     def _body(self, packet: _Packet) -> dict[str, Any]:
         """Return what is recorded of a copy."""
-        delivered = packet.fate is Fate.DELIVERED
-        travelled = packet.fate in (Fate.DELIVERED, Fate.GATED) or packet.exit_ns > packet.entered_ns
+        exit_ns, _, _, lane, number, copy, entered_ns, fate, flipped, payload = packet
+        delivered = fate is _DELIVERED
+        travelled = delivered or fate is Fate.GATED or exit_ns > entered_ns
         body: dict[str, Any] = {
-            "sent_ns": self._origin_ns + packet.entered_ns,
+            "sent_ns": self._origin_ns + entered_ns,
             "delivered_ns": self._origin_ns + self._newest_ns if delivered else None,
-            "number": packet.number,
-            "size": len(packet.payload),
-            "fate": packet.fate.value,
-            "copy": packet.copy,
-            "requested_ns": packet.exit_ns - packet.entered_ns if travelled else None,
+            "number": number,
+            "size": len(payload),
+            "fate": fate._value_,  # what ``value`` returns, which finds it slowly
+            "copy": copy,
+            "requested_ns": exit_ns - entered_ns if travelled else None,
         }
-        if packet.flipped:
-            body["bits"] = list(packet.flipped)
-        if packet.lane.rule is not None:
-            body["rule"] = packet.lane.rule.messages
+        if flipped:
+            body["bits"] = list(flipped)
+        if lane.rule is not None:
+            body["rule"] = lane.rule.messages
         return body
 
 

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import fields
 from typing import Any
 
 from autopilot.link.clock import NS_PER_S
 from sitl.link.changes import format_change
-from sitl.link.direction import LATEST, Direction
+from sitl.link.direction import LATEST, Counters, Direction
 from sitl.link.link import Link
 from sitl.link.rules import format_rule
 from sitl.link.spec import format_spec
@@ -17,6 +17,8 @@ __all__ = ["MAX_CHANGES_SHOWN", "link_counters", "link_status"]
 
 MAX_CHANGES_SHOWN = 16
 """Changes to come that are told, of each direction; the number of all of them is told, too."""
+
+_COUNTS = tuple(field.name for field in fields(Counters))
 
 
 def link_counters(link: Link) -> dict[str, Any]:
@@ -30,16 +32,21 @@ def link_counters(link: Link) -> dict[str, Any]:
 
 
 def _counters(direction: Direction) -> dict[str, Any]:
-    counters: dict[str, Any] = asdict(direction.counters)
+    counters: dict[str, Any] = _counted(direction.counters)
     counters["queued"] = direction.queued
     counters["error_ns"] = direction.errors.summary()
     if direction.rules:
         counters["rules"] = [
-            {"rule": format_rule(lane.rule), **asdict(lane.counters), "queued": lane.queued}
+            {"rule": format_rule(lane.rule), **_counted(lane.counters), "queued": lane.queued}
             for lane in direction.rules
             if lane.rule is not None and lane.counters is not None
         ]
     return counters
+
+
+def _counted(counters: Counters) -> dict[str, int]:
+    """Return all counts by name; they are numbers, so nothing of them need be copied deeply."""
+    return {name: getattr(counters, name) for name in _COUNTS}
 
 
 def link_status(link: Link, now_ns: int) -> dict[str, Any]:

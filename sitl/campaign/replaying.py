@@ -1,0 +1,64 @@
+"""One flight of a campaign as a delay sequence that the MAVLink pair can fly: a witness file."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+
+from gains.switched import eq9, state_loop
+from gains.witnessfile import Witness, write_witness
+from sitl.campaign.engine import drawn_block
+from sitl.campaign.job import Campaign
+from sitl.campaign.kernel import LANES
+
+__all__ = ["delays_of", "growth_per_sample", "write_delays"]
+
+
+def delays_of(campaign: Campaign, flight: int) -> tuple[int, ...]:
+    """Return d(k) of a flight."""
+    if campaign.link is not None:
+        from sitl.campaign.linked import linked_delays
+
+        return tuple(linked_delays(campaign, flight, flight + 1)[0].tolist())
+    return tuple(drawn_block(campaign, flight - flight % LANES).d[:, flight % LANES].tolist())
+
+
+def growth_per_sample(campaign: Campaign, delays: tuple[int, ...]) -> float:
+    """Return ρ^(1/L) of a sequence of L delays that repeats: by how much the loop grows from sample to sample."""
+    loop = state_loop(eq9(campaign.law, min(delays), max(delays)))
+    product, exponent = np.eye(loop.N), 0.0
+    for d in delays:
+        product = loop.F[loop.index(d)] @ product
+        size = float(np.max(np.abs(product)))
+        if size == 0.0:
+            return float(np.finfo(float).tiny)
+        product, exponent = product / size, exponent + np.log(size)
+    rho = float(np.max(np.abs(np.linalg.eigvals(product))))
+    return float(np.exp((np.log(max(rho, np.finfo(float).tiny)) + exponent) / len(delays)))
+
+
+def write_delays(path: Path, campaign: Campaign, flight: int, gains: str) -> None:
+    """Write d(k) of a flight as a witness file, one period as long as the flight.
+
+    Raises
+    ------
+    InputError
+        When the file cannot be written.
+    """
+    delays = delays_of(campaign, flight)
+    in_order = all(d <= before + 1 for before, d in pairwise((delays[-1], *delays)))
+    write_witness(
+        path,
+        Witness(
+            gains=gains,
+            model=campaign.plant.name,
+            Ts=campaign.plant.Ts,
+            d_min=min(delays),
+            d_max=max(delays),
+            transitions="fifo" if in_order else "any",
+            growth_per_sample=growth_per_sample(campaign, delays),
+            delays=delays,
+        ),
+    )
