@@ -22,7 +22,7 @@ COMMANDS = {
     "links": "sitl.commands.links:links",
     "live": "sitl.commands.live:live",
     "plant": "sitl.commands.plant:plant",
-    "rare": "sitl.commands.rare:rare",
+    "rare": "sitl.commands.rare:rare_command",
     "recover": "sitl.commands.recover:recover_command",
     "relay": "sitl.commands.relay:relay",
     "report": "sitl.commands.report:report",
