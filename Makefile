@@ -1,6 +1,7 @@
 # make fly    fly the SITL pair over a laggy link, over UDP on this machine
 # make test   the test suite (under 10 minutes)
 # make check  what CI runs: format, lint, types, import contract
+# make bench  what it costs, as ratios; compiled, too, where there is a C compiler
 # make fuzz   fuzz one decoder: TARGET=autopilot SECONDS=60
 PYTHON ?= python3
 VENV ?= .venv
@@ -9,7 +10,7 @@ FLIGHT ?= nominal
 TARGET ?= autopilot
 SECONDS ?= 60
 
-.PHONY: setup fly test check check-long bench fuzz format clean
+.PHONY: setup fly test check check-long bench compiled fuzz format clean
 
 setup: $(VENV)/ready
 
@@ -37,6 +38,12 @@ check: setup
 
 check-long: setup
 	$(BIN)/pytest -m long
+
+# the same package with its hot path compiled (setup.py), beside the one in $(VENV): PYTHONPATH=build/compiled .venv/bin/sitl fly
+compiled: setup
+	rm -rf build/compiled
+	LAGPROOF_COMPILE=1 $(BIN)/pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation \
+		--target build/compiled .
 
 bench: setup
 	$(BIN)/python -m tests.bench

@@ -152,6 +152,7 @@ HOME = Parsed("HOME", parse_home)
 )
 @click.option("--accept-unsigned", "unsigned", multiple=True, help="A signed PORT that hears unsigned frames, too.")
 @click.option("--require-certificate", is_flag=True, help="Refuse gains without a verified certificate.")
+@click.option("--busy", is_flag=True, help="Never sleep: a processor of its own, and half the time to each command.")
 @process_options
 @click.version_option(version())
 def cli(
@@ -173,6 +174,7 @@ def cli(
     keys: tuple[str, ...],
     unsigned: tuple[str, ...],
     require_certificate: bool,
+    busy: bool,
     clock: Clock,
     record: Path | None,
     stream: Address | None,
@@ -213,7 +215,7 @@ def cli(
         node = AutopilotNode(config)
         if require_certificate:
             _require_certificates(node.settings)
-        _run(node, keyring, options, plant, stations)
+        _run(node, keyring, options, plant, stations, busy=busy)
 
 
 def _require_certificates(settings: Settings) -> None:
@@ -232,7 +234,13 @@ def _require_certificates(settings: Settings) -> None:
 
 
 def _run(
-    node: AutopilotNode, keyring: Keyring, options: ProcessOptions, plant: Address, stations: Sequence[Address]
+    node: AutopilotNode,
+    keyring: Keyring,
+    options: ProcessOptions,
+    plant: Address,
+    stations: Sequence[Address],
+    *,
+    busy: bool,
 ) -> None:
     """Open the ports, say what flies, and fly until told to end."""
     gains, proof = node.pilot.gains, node.proof
@@ -247,7 +255,7 @@ def _run(
         )
     banner = f"autopilot: gains {gains.name} ({proved}){scheduled}{also}, plant {plant[0]}:{plant[1]}"
     metadata = {"program": "autopilot", "gains": gains.name, "version": version()}
-    run_node("autopilot", node, openers, options, metadata, tap=True, banner=banner, keyring=keyring)
+    run_node("autopilot", node, openers, options, metadata, tap=True, banner=banner, keyring=keyring, busy=busy)
 
 
 def _seals(keyring: Keyring, keys: Sequence[str], unsigned: Sequence[str], stations: int) -> dict[str, Seal]:

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections import defaultdict, deque
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 from autopilot.commander import Commander
 from autopilot.config import Home
@@ -80,8 +81,13 @@ IN_AIR = 2
 NO_BATTERY_MV, NO_BATTERY_CA, NO_BATTERY_PERCENT = 65535, -1, -1
 
 _NAMED = (NamedValueInt, NamedValueFloat)
-_Shown = tuple[Message, int]
-"""The latest message of a kind, and when it was."""
+
+
+class _Shown(NamedTuple):
+    """The latest message of a kind, and when it was; what a station has seen is known by this very object."""
+
+    message: Message
+    at_ns: int
 
 
 @dataclass(slots=True, eq=False)
@@ -254,7 +260,7 @@ class Vehicle:
             self.position.flown(message, now_ns)
         name = message.name if isinstance(message, _NAMED) else ""
         kind = type(message)
-        self._shown[kind][name] = message, now_ns
+        self._shown[kind][name] = _Shown(message, now_ns)
         for station in self._stations.values():
             station.news[kind] = None
 

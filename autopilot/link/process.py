@@ -151,6 +151,7 @@ def run_node(
     control: int = 1,
     keyring: Keyring | None = None,
     spin_ns: int = 0,
+    busy: bool = False,
     at_end: Callable[[int], None] | None = None,
 ) -> None:
     """Run a node over UDP until Ctrl-C, SIGTERM or the end of the record stream.
@@ -177,6 +178,8 @@ def run_node(
         The keys of the ports; it is closed at the end.
     spin_ns : int
         How long before a deadline the driver stops sleeping, as :class:`autopilot.link.udp.UdpDriver` takes it.
+    busy : bool
+        Whether it never sleeps, likewise.
     at_end : callable, optional
         Called with the node's time when the loop has ended; what the node records then is recorded.
 
@@ -206,7 +209,7 @@ def run_node(
         sharpen_timers()
         gc.collect()
         gc.freeze()  # what is loaded now stays: no later collection has to look at it
-        driver = UdpDriver(node, ports, options.clock, sink, tap=tap, control=control, spin_ns=spin_ns)
+        driver = UdpDriver(node, ports, options.clock, sink, tap=tap, control=control, spin_ns=spin_ns, busy=busy)
         stack.callback(driver.close)
         driver.on_pass = _chores(driver, keyring, stream)
         driver.run(lambda: stopped or (stream is not None and stream.closed))

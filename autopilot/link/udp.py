@@ -8,8 +8,9 @@ floods; what does not fit there the kernel drops and counts. Ground stations nee
 2,000 datagrams a second takes ten to fifteen percent of a processor, and control comes before each of them.
 
 Sleeps end late, by tens of microseconds even on an idle machine. A driver with ``spin_ns`` therefore wakes that much
-before the node's deadline and looks at its ports, again and again, until the deadline has come. What the sockets
-themselves do is told in :mod:`autopilot.link.ports`.
+before the node's deadline and looks at its ports, again and again, until the deadline has come. A ``busy`` driver never
+sleeps. A processor that slept answers late, and others have emptied its caches meanwhile: a datagram is answered in
+half the time, and a processor is taken for it. What the sockets themselves do is told in :mod:`autopilot.link.ports`.
 """
 
 from __future__ import annotations
@@ -87,6 +88,8 @@ class UdpDriver:
     spin_ns : int
         How long before the node's deadline to stop sleeping and look at the ports again and again: from 0 to
         ``MAX_SPIN_NS``.
+    busy : bool
+        Never to sleep.
 
     Attributes
     ----------
@@ -106,6 +109,7 @@ class UdpDriver:
         control: int = 1,
         on_pass: Callable[[int], None] | None = None,
         spin_ns: int = 0,
+        busy: bool = False,
     ) -> None:
         assert 0 <= spin_ns <= MAX_SPIN_NS, spin_ns
         self.node = node
@@ -114,6 +118,7 @@ class UdpDriver:
         self._control, self._others = self.ports[:control], self.ports[control:]
         self._last = -1
         self.on_pass = on_pass
+        self._busy = busy
         self._spin_ns = spin_ns
         self._spin_left_ns = spin_ns
         self._spin_seen_ns = true_ns()
@@ -174,9 +179,11 @@ class UdpDriver:
     def _wait(self) -> Collection[UdpPort]:
         """Sleep until a datagram comes or the node's deadline, whichever is first; return who has one.
 
-        The last ``spin_ns`` before the deadline it does not sleep but looks, again and again.
+        The last ``spin_ns`` before the deadline, or always if it is busy, it does not sleep but looks again and again.
         """
         deadline_ns = self.node.next_deadline_ns()
+        if self._busy:
+            return self._look_until(None if deadline_ns is None else self.clock.true_ns(deadline_ns))
         if deadline_ns is None:
             return self._look(MAX_WAIT_NS)
         due_ns, now_ns = self.clock.true_ns(deadline_ns), true_ns()
@@ -191,6 +198,14 @@ class UdpDriver:
         while not (ready := self._look(0)) and (now_ns := true_ns()) < due_ns:
             pass
         self._spin_left_ns -= now_ns - begin_ns
+        return ready
+
+    def _look_until(self, due_ns: int | None) -> Collection[UdpPort]:
+        """Look, without sleeping, until a datagram comes, it is due or ``MAX_WAIT_NS`` have passed."""
+        now_ns = true_ns()
+        until_ns = now_ns + MAX_WAIT_NS if due_ns is None else min(due_ns, now_ns + MAX_WAIT_NS)
+        while not (ready := self._look(0)) and true_ns() < until_ns:
+            pass
         return ready
 
     def _may_spin_ns(self, now_ns: int) -> int:

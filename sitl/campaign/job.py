@@ -21,7 +21,7 @@ __all__ = ["MAX_FLIGHTS", "MAX_SAMPLES", "Campaign", "identity"]
 MAX_FLIGHTS = 10**12
 MAX_SAMPLES = 10**6
 
-FORMAT = 1
+FORMAT = 2
 """Of what is drawn how: a campaign that was begun with another one is not gone on with."""
 
 

@@ -1,7 +1,7 @@
 """d(k) of a flight over a link: the relay's own impairment, sampled.
 
 What a flight sends in a sample goes through one :class:`~sitl.link.impairment.Impairment` per direction, the very one
-that the relay uses, at the flight's own instants: the plant's messages at k Ts, the command as soon as both halves of
+that the relay uses, at the flight's own instants: the plant's messages at k Ts, the command as soon as all that carry
 the state have come and none newer has. The plant latches the newest command that has come by k Ts; before the first
 one the delay is k + 1, which Eq. (9) reads as a state of zero. What is left out: TIMESYNC and heartbeats, the time the
 autopilot computes, and the plant's own failsafe.
@@ -15,12 +15,26 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from autopilot.link.wire import AUTOPILOT, PLANT, AoaSsa, Attitude, NamedValueInt, ServoOutputRaw, VfrHud, Wire
+from autopilot.link.wire import (
+    AUTOPILOT,
+    PLANT,
+    AoaSsa,
+    Attitude,
+    Message,
+    NamedValueInt,
+    ServoOutputRaw,
+    VfrHud,
+    Wire,
+)
+from sitl.aircraft.plants import is_nonlinear
 from sitl.campaign.job import Campaign
 from sitl.campaign.kernel import MAX_DELAY
 from sitl.link.impairment import Fate, Impairment, LinkSpec
 
 __all__ = ["delays_over", "linked_delays"]
+
+_STATE = ("ATTITUDE", "AOA_SSA")
+"""What can carry a state, and does where the model does not say."""
 
 _STREAM = 0x11AC  # of the seeds: apart from everything else that a campaign's seed feeds
 
@@ -30,31 +44,30 @@ def linked_delays(campaign: Campaign, start: int, stop: int) -> NDArray[np.uint8
 
     Older than ``MAX_DELAY`` samples counts as so old: what an elevator does then is no matter of this law.
     """
-    assert campaign.link is not None
     sampled = np.empty((stop - start, campaign.samples), dtype=np.uint8)
     for flight in range(start, stop):
         seeds = np.random.SeedSequence(campaign.seed, spawn_key=(_STREAM, flight)).spawn(2)
         up, down = (np.random.Generator(np.random.PCG64(seed)) for seed in seeds)
-        sampled[flight - start] = delays_over(campaign.link, up, down, campaign.samples, campaign.plant.Ts_ns)
+        sampled[flight - start] = delays_over(campaign, up, down)
     return sampled
 
 
-def delays_over(
-    link: tuple[LinkSpec, LinkSpec], up: np.random.Generator, down: np.random.Generator, samples: int, Ts_ns: int
-) -> NDArray[np.uint8]:
+def delays_over(campaign: Campaign, up: np.random.Generator, down: np.random.Generator) -> NDArray[np.uint8]:
     """Return d(k) of one flight, shape (samples,).
 
     Parameters
     ----------
-    link : (LinkSpec, LinkSpec)
-        Up and down.
+    campaign : Campaign
+        Of a link.
     up, down : numpy.random.Generator
         Of the two directions.
-    samples : int
-    Ts_ns : int
     """
-    sent, halves, command_bytes = _sizes()
-    upwards, downwards = _Way(link[0], up), _Way(link[1], down)
+    assert campaign.link is not None
+    samples, Ts_ns = campaign.samples, campaign.plant.Ts_ns
+    fields = campaign.plant.sensors.values()
+    carried = frozenset(field.partition(".")[0] for field in fields) or frozenset(_STATE)
+    sent, halves, command_bytes = _sizes(carried, is_nonlinear(campaign.plant_name))
+    upwards, downwards = _Way(campaign.link[0], up), _Way(campaign.link[1], down)
     came: list[tuple[int, int]] = []  # when the state of sample j was whole at the autopilot, and j
     for j in range(samples):
         exits = [upwards.arrival_ns(size, j * Ts_ns) for size in sent]
@@ -106,15 +119,29 @@ class _Way:
 
 
 @cache
-def _sizes() -> tuple[tuple[int, ...], tuple[int, int], int]:
-    """Return the bytes of what a sample sends, which two of them hold the state, and the bytes of a command."""
+def _sizes(carried: frozenset[str], nonlinear: bool) -> tuple[tuple[int, ...], tuple[int, ...], int]:
+    """Return the bytes of what a sample sends, which of them hold the state, and the bytes of a command.
+
+    Parameters
+    ----------
+    carried : frozenset of str
+        The messages that carry a state. A linear plant sends AOA_SSA only where it does.
+    nonlinear : bool
+        Whether the plant is.
+    """
     plant = Wire(PLANT, AUTOPILOT)
     some = 1.0 / 3.0  # no zero at the end of a payload: MAVLink would cut it off
-    messages = (
-        NamedValueInt(1, "DELAY_K", 3),
-        Attitude(1, some, some, some, some, some, some),
-        AoaSsa(1, some, some),
-        VfrHud(some, some, 1, 1, some, some),
-    )
+    messages: dict[str, Message] = {
+        "NAMED_VALUE_INT": NamedValueInt(1, "DELAY_K", 3),
+        "ATTITUDE": Attitude(1, some, some, some, some, some, some),
+        "AOA_SSA": AoaSsa(1, some, some),
+        "VFR_HUD": VfrHud(some, some, 1, 1, some, some),
+    }
+    sent = {
+        name: len(plant.encode(message))
+        for name, message in messages.items()
+        if name != "AOA_SSA" or nonlinear or name in carried
+    }
+    halves = tuple(n for n, name in enumerate(sent) if name in carried)
     command = Wire(AUTOPILOT, PLANT).encode(ServoOutputRaw(1, servo2_raw=1500))
-    return tuple(len(plant.encode(message)) for message in messages), (1, 2), len(command)
+    return tuple(sent.values()), halves, len(command)

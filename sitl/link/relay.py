@@ -83,7 +83,7 @@ class RelayNode:
         cls, configs: Sequence[LinkConfig], *, stamped: bool = False, log_rate: int = DEFAULT_LOG_RATE
     ) -> RelayNode:
         """Return a relay of one or several links, at most ``MAX_LINKS`` of different names."""
-        node = cls.__new__(cls)
+        node = cls(LinkSpec(), LinkSpec(), 0)
         node._join(configs, None, stamped, log_rate)
         return node
 

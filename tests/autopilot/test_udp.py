@@ -559,14 +559,22 @@ class Sleeper(Probe):
         self.comes_ns = 1 << 62 if came else self.comes_ns
         return list(numbers) if came else [], [], []
 
-    def run(self, monkeypatch: pytest.MonkeyPatch, peer: socket.socket, passes_made: int, spin_ns: int) -> None:
+    def run(
+        self,
+        monkeypatch: pytest.MonkeyPatch,
+        peer: socket.socket,
+        passes_made: int,
+        spin_ns: int = 0,
+        *,
+        busy: bool = False,
+    ) -> None:
         """Make passes; a datagram waits in the socket until its time has come."""
         self.deadline_ns = self.period_ns
         port = dial("p", peer.getsockname())
         peer.sendto(b"x", port.local)
         monkeypatch.setattr(udp, "true_ns", lambda: self.now_ns)
         monkeypatch.setattr(select, "select", self.select)
-        with closing(UdpDriver(self, [port], Clock(), spin_ns=spin_ns)) as driver:
+        with closing(UdpDriver(self, [port], Clock(), spin_ns=spin_ns, busy=busy)) as driver:
             driver.run(passes(passes_made))
 
 
@@ -612,6 +620,23 @@ def test_spinning_takes_no_more_than_its_share_of_the_time(monkeypatch, peer, sp
     assert node.now_ns > 10 * MAX_SPIN_NS
     assert node.spun_ns <= node.now_ns / SPIN_SHARE + MAX_SPIN_NS + LOOK_NS
     assert node.sleeps
+
+
+def test_a_busy_driver_never_sleeps_and_serves_a_datagram_at_once(monkeypatch, peer):
+    node = Sleeper(comes_ns=SAMPLE_NS // 2)
+    node.run(monkeypatch, peer, 6, busy=True)
+    ((_, datagram, now_ns),) = node.got
+    assert datagram == b"x"
+    assert SAMPLE_NS // 2 <= now_ns < SAMPLE_NS // 2 + LOOK_NS
+    assert node.sleeps == []
+    assert all(0 <= late_ns < LOOK_NS for late_ns in node.late_ns)
+
+
+def test_a_busy_driver_without_a_deadline_soon_sees_that_it_shall_stop(monkeypatch, peer):
+    node = Sleeper(period_ns=10 * MAX_WAIT_NS)
+    node.run(monkeypatch, peer, 2, busy=True)
+    assert node.sleeps == []
+    assert 2 * MAX_WAIT_NS <= node.now_ns <= 2 * (MAX_WAIT_NS + LOOK_NS)
 
 
 # what the node lives on

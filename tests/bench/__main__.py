@@ -24,7 +24,7 @@ import click
 from rich.console import Console
 from rich.table import Table
 
-from tests.bench import campaign, certify, design, estimators, exact, flight, flood, relay, turnaround
+from tests.bench import campaign, certify, compiled, design, estimators, exact, flight, flood, relay, turnaround
 
 KEPT = Path(__file__).with_name("kept.json")
 WORSE = 1.2
@@ -35,6 +35,7 @@ BENCHES: dict[str, Callable[[], list[tuple[str, float, float, str]]]] = {
     "estimators": estimators.measure,
     "exact": exact.measure,
     "flight": flight.measure,
+    "compiled": compiled.measure,
     "turnaround": turnaround.measure,
     "flood": flood.measure,
     "relay": relay.measure,
