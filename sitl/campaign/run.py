@@ -1,8 +1,9 @@
 """A campaign from its first flight to its last: in this process, or by Dask on many cores and machines.
 
 The first flights are timed, and the rest is cut into tasks that take about ``TASK_S`` each: short enough to be done
-again without regret when a worker dies, long enough that handing them out costs nothing. What comes back is written as
-it comes (:mod:`sitl.campaign.parts`) or kept, and put in order by number.
+again without regret when a worker dies, long enough that handing them out costs nothing. Where all of it takes little
+more than that, tasks are shorter, so that every worker has some. What comes back is written as it comes
+(:mod:`sitl.campaign.parts`) or kept, and put in order by number.
 """
 
 from __future__ import annotations
@@ -28,6 +29,9 @@ __all__ = ["Outcome", "run"]
 
 TASK_S = 1.0
 """What a task shall take."""
+
+SHARES, LEAST_S = 8, 0.02
+"""Tasks for each worker at the least, and what each of them shall take at the least."""
 
 FIRST = 2 * LANES
 """Flights that are timed."""
@@ -106,8 +110,8 @@ def run(
     fly(campaign, 0, 1)  # compiled, or loaded
     begun = time.perf_counter()
     ranges, per_flight_s = _timed(campaign, ranges, collected)
-    tasks = _tasks(ranges, per_flight_s)
     left_s = per_flight_s * sum(stop - start for start, stop in ranges)
+    tasks = _tasks(ranges, per_flight_s, min(max(left_s / (SHARES * workers), LEAST_S), TASK_S))
     if scheduler not in ("local", "none"):
         workers = _with_dask(campaign, tasks, collected, scheduler, workers)
     elif scheduler == "local" and left_s > WORTH_S and workers > 1 and not is_compiled(campaign):
@@ -158,9 +162,9 @@ def _timed(campaign: Campaign, ranges: list[Range], collected: _Collected) -> tu
     return ([(last, stop)] if last < stop else []) + rest, took_s / (last - start)
 
 
-def _tasks(ranges: list[Range], per_flight_s: float) -> Iterator[Range]:
-    """Cut ranges into tasks, at the multiples of whole blocks where a task has more than one."""
-    count = min(max(1, round(TASK_S / max(per_flight_s, 1e-9))), MOST)
+def _tasks(ranges: list[Range], per_flight_s: float, task_s: float) -> Iterator[Range]:
+    """Cut ranges into tasks of so long, at the multiples of whole blocks where a task has more than one."""
+    count = min(max(1, round(task_s / max(per_flight_s, 1e-9))), MOST)
     if count > LANES:
         count -= count % LANES
     for start, stop in ranges:

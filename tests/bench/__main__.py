@@ -24,7 +24,7 @@ import click
 from rich.console import Console
 from rich.table import Table
 
-from tests.bench import campaign, certify, compiled, design, estimators, exact, flight, flood, relay, turnaround
+from tests.bench import campaign, certify, codec, compiled, design, estimators, exact, flight, flood, relay, turnaround
 
 KEPT = Path(__file__).with_name("kept.json")
 WORSE = 1.2
@@ -34,6 +34,7 @@ BENCHES: dict[str, Callable[[], list[tuple[str, float, float, str]]]] = {
     "design": design.measure,
     "estimators": estimators.measure,
     "exact": exact.measure,
+    "codec": codec.measure,
     "flight": flight.measure,
     "compiled": compiled.measure,
     "turnaround": turnaround.measure,

