@@ -9,8 +9,9 @@ autopilot computes, and the plant's own failsafe.
 
 from __future__ import annotations
 
+import math
 from bisect import bisect_right, insort
-from functools import cache
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,15 +27,15 @@ from autopilot.link.wire import (
     VfrHud,
     Wire,
 )
+from gains.model import Model
+from sitl.aircraft.airframe import Pose
+from sitl.aircraft.linear import LinearAirframe
 from sitl.aircraft.plants import is_nonlinear
 from sitl.campaign.job import Campaign
 from sitl.campaign.kernel import MAX_DELAY
 from sitl.link.impairment import Fate, Impairment, LinkSpec
 
 __all__ = ["delays_over", "linked_delays"]
-
-_STATE = ("ATTITUDE", "AOA_SSA")
-"""What can carry a state, and does where the model does not say."""
 
 _STREAM = 0x11AC  # of the seeds: apart from everything else that a campaign's seed feeds
 
@@ -64,9 +65,7 @@ def delays_over(campaign: Campaign, up: np.random.Generator, down: np.random.Gen
     """
     assert campaign.link is not None
     samples, Ts_ns = campaign.samples, campaign.plant.Ts_ns
-    fields = campaign.plant.sensors.values()
-    carried = frozenset(field.partition(".")[0] for field in fields) or frozenset(_STATE)
-    sent, halves, command_bytes = _sizes(carried, is_nonlinear(campaign.plant_name))
+    sent, halves, command_bytes = _sizes(campaign.plant, is_nonlinear(campaign.plant_name))
     upwards, downwards = _Way(campaign.link[0], up), _Way(campaign.link[1], down)
     came: list[tuple[int, int]] = []  # when the state of sample j was whole at the autopilot, and j
     for j in range(samples):
@@ -118,30 +117,33 @@ class _Way:
         return min(whole, default=None)
 
 
-@cache
-def _sizes(carried: frozenset[str], nonlinear: bool) -> tuple[tuple[int, ...], tuple[int, ...], int]:
+@lru_cache(maxsize=8)
+def _sizes(plant: Model, nonlinear: bool) -> tuple[tuple[int, ...], tuple[int, ...], int]:
     """Return the bytes of what a sample sends, which of them hold the state, and the bytes of a command.
 
-    Parameters
-    ----------
-    carried : frozenset of str
-        The messages that carry a state. A linear plant sends AOA_SSA only where it does.
-    nonlinear : bool
-        Whether the plant is.
+    MAVLink cuts zeros off the end of a payload: what a linear aircraft does not move in costs nothing.
     """
-    plant = Wire(PLANT, AUTOPILOT)
-    some = 1.0 / 3.0  # no zero at the end of a payload: MAVLink would cut it off
+    somewhere = plant.trim.x + np.linspace(0.1, 0.2, plant.nx)
+    pose = Pose(*[1.0 / 3.0] * len(Pose._fields)) if nonlinear else LinearAirframe(plant, somewhere).pose
+    angles = (pose.roll_rad, pose.pitch_rad, pose.yaw_rad, pose.p_rad_s, pose.q_rad_s, pose.r_rad_s)
+    turned = round(math.degrees(pose.yaw_rad))
+    carried = {field.partition(".")[0] for field in plant.sensors.values()} or {"ATTITUDE", "AOA_SSA"}
     messages: dict[str, Message] = {
         "NAMED_VALUE_INT": NamedValueInt(1, "DELAY_K", 3),
-        "ATTITUDE": Attitude(1, some, some, some, some, some, some),
-        "AOA_SSA": AoaSsa(1, some, some),
-        "VFR_HUD": VfrHud(some, some, 1, 1, some, some),
+        "ATTITUDE": Attitude(1, *angles),
+        "AOA_SSA": AoaSsa(1, pose.alpha_rad, pose.beta_rad),
+        "VFR_HUD": VfrHud(
+            pose.airspeed_m_s,
+            pose.groundspeed_m_s,
+            turned,
+            round(100.0 * pose.throttle),
+            pose.altitude_m,
+            pose.climb_m_s,
+        ),
     }
-    sent = {
-        name: len(plant.encode(message))
-        for name, message in messages.items()
-        if name != "AOA_SSA" or nonlinear or name in carried
-    }
-    halves = tuple(n for n, name in enumerate(sent) if name in carried)
+    if not nonlinear and "AOA_SSA" not in carried:
+        del messages["AOA_SSA"]
+    wire = Wire(PLANT, AUTOPILOT)
+    halves = tuple(n for n, name in enumerate(messages) if name in carried)
     command = Wire(AUTOPILOT, PLANT).encode(ServoOutputRaw(1, servo2_raw=1500))
-    return tuple(sent.values()), halves, len(command)
+    return tuple(len(wire.encode(message)) for message in messages.values()), halves, len(command)

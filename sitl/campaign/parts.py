@@ -1,10 +1,11 @@
 """Results of a campaign on disk: a folder of Parquet files, each a range of flights, and what the campaign is.
 
-    campaign.json                                   the description, and the campaign's identity
+    _campaign.json                                  the description, and the campaign's identity
     flights-000000000000-000000131072.parquet       flights from 0 to before 131072, one row each
 
 A part is written beside its place and moved there, so one that is there is whole; which are there is all that a resumed
-campaign needs to know. The same columns read in any tool: ``pandas.read_parquet("folder")``, DuckDB, Polars.
+campaign needs to know. One that is damaged all the same is put aside, and its flights are flown again. The folder reads
+as one table in any tool, ``pandas.read_parquet("folder")``, DuckDB, Polars: what begins with _ or . they pass over.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from sitl.campaign.engine import Columns
 
 __all__ = ["Part", "Parts", "missing_ranges"]
 
-DESCRIPTION = "campaign.json"
+DESCRIPTION = "_campaign.json"
 _NAME = re.compile(r"flights-([0-9]{12})-([0-9]{12})\.parquet")
 
 
@@ -58,6 +59,7 @@ class Parts:
 
     def __init__(self, folder: Path, identity: str, description: Mapping[str, Any]) -> None:
         self.folder = folder
+        self._parts: list[Part] = []
         try:
             folder.mkdir(parents=True, exist_ok=True)
             self._claim(identity, description)
@@ -75,15 +77,16 @@ class Parts:
             if found != identity:
                 raise InputError(
                     f"{self.folder}: expected an empty folder or results of the same campaign, found those of another"
-                    f" ({found[:12]}, not {identity[:12]})"
+                    f" ({str(found)[:12]}, not {identity[:12]})"
                 )
         elif any(self.folder.iterdir()):
             raise InputError(f"{self.folder}: expected an empty folder or one with {DESCRIPTION}, found other files")
         replace_file(path, orjson.dumps({**description, "identity": identity}, option=orjson.OPT_INDENT_2))
 
     def found(self) -> list[Part]:
-        """Return the whole parts, in the order of flights, without those that overlap an earlier one."""
+        """Return the whole parts, in the order of flights; damaged ones, and what overlaps an earlier one, go aside."""
         parts: list[Part] = []
+        self._parts = parts
         for path in sorted(self.folder.iterdir()):
             match = _NAME.fullmatch(path.name)
             if match is None:
@@ -91,27 +94,40 @@ class Parts:
             start, stop = int(match[1]), int(match[2])
             if (not parts or start >= parts[-1].stop) and _rows(path) == stop - start > 0:
                 parts.append(Part(start, stop, path))
-        return parts
+            else:
+                path.replace(path.with_name(f"_aside-{path.name}"))
+        return list(parts)
 
     def write(self, start: int, stop: int, columns: Columns) -> None:
-        """Write one part."""
+        """Write one part.
+
+        Raises
+        ------
+        InputError
+            When it cannot be written, the disk being full for example.
+        """
         path = self.folder / f"flights-{start:012d}-{stop:012d}.parquet"
-        unfinished = path.with_suffix(f".{os.getpid()}.tmp")
-        pq.write_table(pa.table(dict(columns)), unfinished, compression="zstd")
-        os.replace(unfinished, path)
+        unfinished = path.with_name(f".{path.stem}.{os.getpid()}.tmp")
+        try:
+            pq.write_table(pa.table(dict(columns)), unfinished, compression="zstd", write_page_checksum=True)
+            os.replace(unfinished, path)
+        except OSError as error:
+            unfinished.unlink(missing_ok=True)
+            raise InputError(f"{path}: cannot be written: {error.strerror or error}") from None
+        self._parts.append(Part(start, stop, path))
 
     def read(self, flights: int) -> Iterator[Columns]:
-        """Yield the parts' columns up to a number of flights, in order."""
-        for part in self.found():
+        """Yield the columns of the parts that were found or written, up to a number of flights, in order."""
+        for part in sorted(self._parts):
             if part.start < flights:
                 table = pq.read_table(part.path).slice(0, flights - part.start)
                 yield {name: np.asarray(table[name]) for name in table.column_names}
 
 
 def _rows(path: Path) -> int:
-    """Return how many rows a file has; -1 for one that is damaged."""
+    """Return how many rows a file has; -1 for one that is damaged anywhere."""
     try:
-        return int(pq.read_metadata(path).num_rows)
+        return int(pq.read_table(path, page_checksum_verification=True).num_rows)
     except (OSError, pa.ArrowException):
         return -1
 
