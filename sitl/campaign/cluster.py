@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import re
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from typing import Any
@@ -11,6 +12,8 @@ from gains.command import version
 from gains.table import InputError
 
 __all__ = ["connected"]
+
+_ADDRESS = re.compile(r"(tcp|tls)://(\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9.-]+):[0-9]{1,5}")
 
 PATIENCE_S = 15.0
 """For a scheduler to answer, and for its first worker."""
@@ -32,8 +35,11 @@ def connected(address: str | None, workers: int) -> Iterator[Any]:
     InputError
         When nobody answers, no worker is there, or one has not the same version of this package.
     """
+    if address is not None and not _ADDRESS.fullmatch(address):  # some of what is none keeps Dask waiting for ever
+        raise InputError(f'scheduler "{address}": expected local, none or tcp://HOST:PORT')
     try:
         from distributed import Client, LocalCluster
+        from distributed.comm.addressing import get_address_host_port
     except ImportError:
         raise InputError("campaign: expected Dask (pip install 'lagproof[campaign]'), found none") from None
     with ExitStack() as stack:
@@ -43,12 +49,13 @@ def connected(address: str | None, workers: int) -> Iterator[Any]:
                     n_workers=workers,
                     threads_per_worker=1,
                     host="127.0.0.1",
-                    dashboard_address=None,
+                    dashboard_address="127.0.0.1:0",
                     silence_logs=logging.ERROR,
                 )
             )
             address = cluster.scheduler_address
         try:
+            get_address_host_port(address)  # a client that is refused its address complains once more at exit
             client = stack.enter_context(Client(address, timeout=PATIENCE_S, set_as_default=False))
             client.wait_for_workers(1, timeout=PATIENCE_S)
             found = set(client.run(version).values())

@@ -13,9 +13,10 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from gains.atomic import replace_file
 from gains.certificate import model_hash
+from gains.table import InputError
 from sitl.aircraft.plants import is_nonlinear
 from sitl.campaign.bounds import Bound, certified_bound
-from sitl.campaign.comparison import Comparison, compare
+from sitl.campaign.comparison import MAX_CONTROLLERS, Comparison, compare
 from sitl.campaign.engine import Columns
 from sitl.campaign.job import Campaign, identity
 from sitl.campaign.page import campaign_page
@@ -74,7 +75,13 @@ def conduct(
         Where results are written.
     quiet : bool
         Without the bar.
+
+    Raises
+    ------
+    InputError
+        For too many to compare, two that would share a folder, and what :func:`sitl.campaign.run.run` refuses.
     """
+    _check_names(list(jobs), folder)
     console = Console(stderr=True)
     flown = []
     bar = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
@@ -101,6 +108,16 @@ def conduct(
     else:
         measured = (measure(flown[0].columns, eta=flown[0].bound.eta, threshold=threshold),)
     return Report(tuple(flown), measured, comparison, delays, threshold)
+
+
+def _check_names(names: list[str], folder: Path | None) -> None:
+    """Refuse before anything flies what could not be compared or kept afterwards."""
+    if len(names) > MAX_CONTROLLERS:
+        raise InputError(f"--gains: expected at most {MAX_CONTROLLERS} to compare, found {len(names)}")
+    own = [_file_name(name) for name in names]
+    twice = next((name for name in own if own.count(name) > 1), None)
+    if folder is not None and twice is not None:
+        raise InputError(f"{folder}: expected --gains of different names, for a folder each, found {twice} twice")
 
 
 def _file_name(name: str) -> str:

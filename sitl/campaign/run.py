@@ -206,9 +206,19 @@ def _with_dask(
         completed = as_completed([future for _, future in running.values()], loop=client.loop)
         for future in completed:
             one, _ = running.pop(future.key)
-            collected.add(*one, future.result())
+            collected.add(*one, _result_of(future, one))
             for following in islice(tasks, 1):
                 added = submit(following)
                 running[added.key] = (following, added)
                 completed.add(added)
     return count
+
+
+def _result_of(future: Any, one: Range) -> Columns:
+    """Return what a cluster flew; what failed each time, or was lost with the scheduler, is refused on one line."""
+    try:
+        columns: Columns = future.result()
+    except Exception as error:
+        said = " ".join(f"{type(error).__name__}: {error}".split())
+        raise InputError(f"flights from {one[0]} to before {one[1]}: expected results, found {said}") from error
+    return columns
