@@ -17,7 +17,7 @@ from sitl.campaign.job import Campaign
 from sitl.campaign.kernel import LANES
 from sitl.campaign.philox import DELAY, GUST, HOLD, PARAMETERS, normals, uniform, words, words_inlined
 
-__all__ = ["COLUMNS", "Draw", "Waveform", "draw_block", "draw_of"]
+__all__ = ["COLUMNS", "MAX_CHANNELS", "Draw", "Waveform", "draw_block", "draw_of"]
 
 COLUMNS = (
     "gust_amplitude",
@@ -34,7 +34,9 @@ _DELTA_PERIOD = Span(2.0, 200.0)
 """Samples, of the square wave δ; Eq. (51) has 40."""
 
 _GUST_AT, _REFERENCE_AT, _DELTA_AT, _X0_AT = 0, 16, 32, 48
-"""Where in the stream of parameters each begins: at most 32 channels of four numbers each."""
+"""Where in the stream of parameters each begins: a gust or a reference has ``MAX_CHANNELS`` at most."""
+
+MAX_CHANNELS = _REFERENCE_AT - _GUST_AT - 1
 
 
 class Waveform(NamedTuple):

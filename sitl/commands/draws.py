@@ -190,10 +190,14 @@ def _check_possible(job: Campaign) -> None:
     """Refuse what the plant cannot do."""
     from sitl.aircraft.plants import airframe_maker, is_nonlinear
     from sitl.campaign.job import MAX_FLIGHTS, MAX_SAMPLES
+    from sitl.campaign.signals import MAX_CHANNELS
 
     for option, number, most in (("--flights", job.flights, MAX_FLIGHTS), ("--samples", job.samples, MAX_SAMPLES)):
         if number > most:
             raise InputError(f"{option}: expected at most {most}, found {number}")
+    channels = max(job.plant.nw, 0 if job.law.model.reference is None else job.law.model.reference.Br.shape[1])
+    if channels > MAX_CHANNELS:
+        raise InputError(f"--plant: expected at most {MAX_CHANNELS} channels of gust or reference, found {channels}")
     nonlinear = is_nonlinear(job.plant_name)
     if job.uncertain and (nonlinear or job.plant.uncertainty is None):
         raise InputError(f"--delta: expected a linear plant with [uncertainty], found {job.plant_name} without")

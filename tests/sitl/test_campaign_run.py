@@ -30,7 +30,7 @@ from sitl.campaign import parts as keeping
 from sitl.campaign import run as running
 from sitl.campaign.engine import Columns
 from sitl.campaign.job import Campaign
-from sitl.campaign.parts import Part, Parts, missing_ranges
+from sitl.campaign.parts import Parts, missing_ranges
 from sitl.campaign.tasks import fly
 from sitl.scenario import stored_scenarios
 from tests.sitl.test_campaign_parts import campaign, equal, parts_in
@@ -127,7 +127,8 @@ def test_a_run_flies_what_is_missing_exactly_once_and_tells_of_each_flight(
     parts = parts_in(tmp_path, job)
     for start, stop in kept:
         parts.write(start, stop, count(job, start, stop))
-    monkeypatch.setattr(running, "fly", lambda job, a, b: {} if b - a == 1 == b else count(job, a, b))  # not the first
+    # a first flight, of which nothing is kept, compiles
+    monkeypatch.setattr(running, "fly", lambda job, a, b: {} if (a, b) == (0, 1) else count(job, a, b))
     monkeypatch.setattr(running, "_timed", lambda _job, ranges, _collected: (ranges, 1e-3))
     outcome = running.run(job, scheduler="none", workers=workers, parts=parts_in(tmp_path, job), told=told.append)
     assert (flown[:500] == 1).all()
@@ -239,7 +240,7 @@ def test_the_numbers_of_the_json_are_those_of_the_rows(command: Command, tmp_pat
 @pytest.mark.parametrize(("above", "code"), [(1.001, 0), (0.999, 1)])
 def test_the_exit_code_turns_at_the_largest_error(command: Command, above: float, code: int, tmp_path: Path) -> None:
     assert command(f"{SMALL} --json -o out").code == 0
-    threshold = above * table_in(tmp_path / "out")["max_error"].max()
+    threshold = above * float(table_in(tmp_path / "out")["max_error"].max())
     said = command(f"{SMALL} --json -o out --threshold {threshold!r}")
     assert (said.code, said.json["failure_probability"]["count"]) == (code, code)
 
@@ -256,7 +257,7 @@ def test_a_gain_above_eta_is_a_failure_inside_the_window_and_none_outside(comman
 
 def test_a_witness_diverges_as_its_file_predicts_and_ends_with_1(command: Command) -> None:
     path = stored_scenarios()["witness-pendulum"].with_name("witness-pendulum.csv")
-    line = f"--gains pendulum-paper --delay 1:7 --transitions fifo --gust none --x0 0.005 --samples 20000 --flights 32"
+    line = "--gains pendulum-paper --delay 1:7 --transitions fifo --gust none --x0 0.005 --samples 20000 --flights 32"
     said = command(f"{line} --scheduler none --json --delays", f"cycle:{path}")
     told, written = said.json, float(re.findall("growth_per_sample: (.*)", path.read_text())[0])
     assert (said.code, told["diverged"], told["max_gain"]) == (1, 32, None)
@@ -323,7 +324,6 @@ class Links(HTMLParser):
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         self.found += [value or "" for name, value in attrs if name in ("src", "href", "srcset", "action", "data")]
-        self.found += [tag] if tag in ("link", "iframe", "base") else []
 
 
 def test_the_page_needs_no_network(command: Command, tmp_path: Path) -> None:
