@@ -39,10 +39,10 @@ def connected(address: str | None, workers: int) -> Iterator[Any]:
         raise InputError(f'scheduler "{address}": expected local, none or tcp://HOST:PORT')
     try:
         from distributed import Client, LocalCluster
-        from distributed.comm.addressing import get_address_host_port
     except ImportError:
         raise InputError("campaign: expected Dask (pip install 'lagproof[campaign]'), found none") from None
     with ExitStack() as stack:
+        _silence(logging.getLogger("distributed.client"), stack)
         if address is None:
             cluster = stack.enter_context(
                 LocalCluster(
@@ -55,7 +55,6 @@ def connected(address: str | None, workers: int) -> Iterator[Any]:
             )
             address = cluster.scheduler_address
         try:
-            get_address_host_port(address)  # a client that is refused its address complains once more at exit
             client = stack.enter_context(Client(address, timeout=PATIENCE_S, set_as_default=False))
             client.wait_for_workers(1, timeout=PATIENCE_S)
             found = set(client.run(version).values())
@@ -68,6 +67,12 @@ def connected(address: str | None, workers: int) -> Iterator[Any]:
                 f'scheduler "{address}": expected workers of lagproof {version()}, found {", ".join(sorted(found))}'
             )
         yield client
+
+
+def _silence(logger: logging.Logger, stack: ExitStack) -> None:
+    """Keep the traceback of a connection that is lost off stderr: the results that are lost with it say so."""
+    stack.callback(logger.setLevel, logger.level)
+    logger.setLevel(logging.CRITICAL)
 
 
 def _said(error: Exception) -> str:

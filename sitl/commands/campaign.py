@@ -66,6 +66,7 @@ def campaign(
             require_writable(file)
     require_numba()
     from gains.store import load_law, require_law
+    from gains.witnessfile import MAX_PERIOD
     from sitl.aircraft.wind import parse_wind
     from sitl.campaign.conducting import conduct
     from sitl.link.presets import parse_link
@@ -77,8 +78,9 @@ def campaign(
         raise InputError("--delays: expected none beside --link, --up and --down, which make the delays")
     delays = None if link is not None else draws.delays(first, delays_text or "uniform")
     wind = None if wind_text is None else parse_wind(wind_text)
-    window = draws.window_of(first)
-    jobs = {name: draws.campaign(law, flights, delays, link, wind, window) for name, law in laws.items()}
+    jobs = {name: draws.campaign(law, flights, delays, link, wind, first) for name, law in laws.items()}
+    if worst is not None and draws.samples > MAX_PERIOD:
+        raise InputError(f"--worst: expected at most {MAX_PERIOD} samples, found {draws.samples}")
     threshold = None if threshold_text is None else one_number(threshold_text, "--threshold")
     links = (preset, up and f"up {up}", down and f"down {down}")
     asked = " ".join(filter(None, links)) if delays is None else delays.text

@@ -78,7 +78,7 @@ class Draws:
         delays: DelayProcess | None,
         link: tuple[LinkSpec, LinkSpec] | None = None,
         wind: WindSpec | None = None,
-        window: tuple[int, int] | None = None,
+        first: GainLaw | None = None,
     ) -> Campaign:
         """Return the campaign of a law.
 
@@ -90,8 +90,9 @@ class Draws:
         link : (LinkSpec, LinkSpec), optional
             Up and down, where these make the delays.
         wind : WindSpec, optional
-        window : (int, int), optional
-            What is claimed; by default that of the options or else the law's.
+        first : Gains or Schedule, optional
+            Of several laws that are compared the first: its model is what all of them fly, and its window what is
+            claimed, where the options say neither.
 
         Raises
         ------
@@ -102,13 +103,14 @@ class Draws:
         from sitl.campaign.distributions import parse_signal, parse_span
         from sitl.campaign.job import Campaign
 
-        plant = law.model if self.plant is None else plant_model(self.plant, law.model)
+        own = (first or law).model
+        plant = own if self.plant is None else plant_model(self.plant, own)
         _check_fit(law, plant)
-        d_min, d_max = window or self.window_of(law)
+        d_min, d_max = self.window_of(first or law)
         job = Campaign(
             law=law,
             plant=plant,
-            plant_name=self.plant or law.model.name,
+            plant_name=self.plant or own.name,
             d_min=d_min,
             d_max=d_max,
             transitions=self.transitions,

@@ -1,19 +1,13 @@
-"""Campaigns by Dask, and campaigns that are killed: neither changes a number."""
+"""Campaigns by Dask: not a number changes, and no port opens but on this machine. What breaks: test_campaign_crash."""
 
 from __future__ import annotations
 
 import logging
 import os
-import signal
-import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import distributed
-import numpy as np
-import pyarrow.parquet as pq
 import pytest
 from distributed import LocalCluster
 
@@ -21,7 +15,6 @@ from gains.table import InputError
 from sitl.campaign import cluster, tasks
 from sitl.campaign.run import run
 from sitl.link.presets import parse_link
-from tests.integration.programs import ENVIRONMENT, eventually
 from tests.sitl.test_campaign_parts import campaign, equal, parts_in
 
 LINKED = {"delays": None, "link": parse_link("lte", None, None), "samples": 400}
@@ -40,10 +33,6 @@ def dask() -> Iterator[LocalCluster]:
         yield local
 
 
-def processes_of(local: LocalCluster) -> set[int]:
-    return {worker.pid for worker in local.workers.values() if worker.pid is not None}
-
-
 def test_a_cluster_flies_the_same_to_the_last_bit(dask: LocalCluster) -> None:
     job = campaign(flights=3000)
     outcome = run(job, scheduler=dask.scheduler_address)
@@ -56,56 +45,6 @@ def test_links_are_sampled_by_a_cluster_as_by_one_process(dask: LocalCluster, tm
     outcome = run(job, scheduler=dask.scheduler_address, parts=parts_in(tmp_path, job))
     assert len(list(tmp_path.glob("flights-*"))) > 4
     assert equal(outcome.columns, tasks.fly(job, 0, 40))
-
-
-@pytest.mark.long
-def test_a_worker_that_is_killed_changes_nothing(dask: LocalCluster) -> None:
-    job, killed, told = campaign(**LINKED, flights=600), set[int](), 0
-
-    def kill_one(flights: int) -> None:
-        nonlocal told
-        told += flights
-        if told >= 100 and not killed:
-            victim = min(processes_of(dask))
-            os.kill(victim, signal.SIGKILL)
-            killed.add(victim)
-
-    outcome = run(job, scheduler=dask.scheduler_address, told=kill_one)
-    assert killed
-    assert told == 600
-    eventually("another worker in its place", lambda: len(processes_of(dask)) == 2)
-    assert not killed & processes_of(dask)
-    assert equal(outcome.columns, run(job, scheduler="none", workers=1).columns)
-
-
-@pytest.mark.long
-def test_a_campaign_that_is_killed_goes_on_where_it_was(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "sitl", "campaign", "--gains", "hirm-paper", "--link", "lte", "--flights", "300",
-               "--scheduler", "none", "--json", "-o"]  # fmt: skip
-    whole, broken = tmp_path / "whole", tmp_path / "broken"
-    subprocess.run([*command, str(whole)], env=ENVIRONMENT, check=True, capture_output=True, timeout=120)
-    for parts in (2, 5):
-        process = subprocess.Popen([*command, str(broken)], env=ENVIRONMENT, stdout=subprocess.DEVNULL)
-        eventually("some parts", lambda n=parts: len(list(broken.glob("flights-*.parquet"))) >= n)  # type: ignore[misc]
-        process.kill()
-        process.wait()
-    kept = {path.name for path in broken.glob("flights-*")}
-    assert len(kept) < len(list(whole.glob("flights-*")))
-    subprocess.run([*command, str(broken)], env=ENVIRONMENT, check=True, capture_output=True, timeout=120)
-    assert kept <= {path.name for path in broken.glob("flights-*")}
-    assert equal(*(by_flight(folder) for folder in (whole, broken)))
-
-
-def by_flight(folder: Path) -> dict[str, Any]:
-    table = pq.read_table(folder).sort_by("flight")
-    return {name: np.asarray(table[name]) for name in table.column_names}
-
-
-def test_a_scheduler_that_is_not_there_is_named_soon(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cluster, "PATIENCE_S", 1.0)
-    with pytest.raises(InputError, match=r"tcp://127\.0\.0\.1:9") as refused:
-        run(campaign(), scheduler="tcp://127.0.0.1:9")
-    assert "\n" not in str(refused.value)
 
 
 @pytest.mark.parametrize(

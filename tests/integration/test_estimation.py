@@ -6,6 +6,9 @@ knows the links (``forecasters.py``).
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -33,7 +36,12 @@ def flight_of(case: Case) -> Flight:
     return fly(case, SEED)
 
 
-@pytest.mark.parametrize("case", STEADY_RETURN, ids=str)
+def by_length(cases: Iterable[Case]) -> list[Any]:
+    """Return the cases as parameters; those in order, which differ little from the others, are long."""
+    return [pytest.param(case, marks=pytest.mark.long if case.keep_order else ()) for case in cases]
+
+
+@pytest.mark.parametrize("case", by_length(STEADY_RETURN), ids=str)
 def test_d_is_forecast_exactly_where_the_return_has_no_jitter(case: Case) -> None:
     flight = flight_of(case)
     _, d = flight.applied
@@ -41,7 +49,7 @@ def test_d_is_forecast_exactly_where_the_return_has_no_jitter(case: Case) -> Non
     assert score(Forecasts.of(flight), d).exact >= 0.999
 
 
-@pytest.mark.parametrize("case", RANDOM_RETURN, ids=str)
+@pytest.mark.parametrize("case", by_length(RANDOM_RETURN), ids=str)
 def test_elsewhere_d_is_forecast_nearly_as_well_and_as_closely_as_is_possible(case: Case) -> None:
     flight = flight_of(case)
     rows, d = flight.applied
@@ -61,7 +69,7 @@ def test_intervals_hold_the_delay_as_often_as_they_say() -> None:
     assert probability.min() >= 0.95
 
 
-@pytest.mark.parametrize("case", CASES, ids=str)
+@pytest.mark.parametrize("case", by_length(CASES), ids=str)
 def test_the_delay_reported_is_the_true_one_and_the_one_that_follows_from_the_packets(case: Case) -> None:
     flight = flight_of(case)
     assert agrees(flight)

@@ -580,8 +580,8 @@ HARD = parse_signal("sine:2deg..9deg:0.5s..10s", "gust")
         campaign("hirm-d6", delays=delays("hold:0.9", 0, 9, fifo=True), gust=parse_signal("white:1deg", "gust")),
         campaign("pendulum-paper", gust=parse_signal("sine:0.1", "gust"), reference=Signal()),
         campaign(delta=Span(0.0, 0.15)),
-        campaign(law=two_sets(HIRM), plant=LAGGING, limits=True, delta=Span(0.1, 0.15), gust=HARD, x0=0.1,
-                 delays=delays("uniform", 0, 6)),
+        pytest.param(campaign(law=two_sets(HIRM), plant=LAGGING, limits=True, delta=Span(0.1, 0.15), gust=HARD, x0=0.1,
+                              delays=delays("uniform", 0, 6)), marks=pytest.mark.long),
         pytest.param(campaign(law=two_sets(HIRM), delays=delays("uniform", 0, 6)), marks=pytest.mark.long),
         pytest.param(campaign(plant=LAGGING, limits=True, gust=HARD), marks=pytest.mark.long),
         pytest.param(campaign(limits=True, gust=parse_signal("sine:90deg", "gust")), marks=pytest.mark.long),
@@ -756,8 +756,8 @@ def test_the_growth_of_a_constant_delay_is_its_spectral_radius() -> None:
     [
         campaign(x0=0.05, delays=delays("geometric:3"), samples=150),
         campaign("pendulum-paper", gust=parse_signal("sine:0.1", "gust"), reference=Signal(), samples=150),
-        campaign(law=two_sets(HIRM), plant=LAGGING, limits=True, delta=Span(0.1, 0.15), gust=HARD, x0=0.1, samples=150,
-                 delays=delays("uniform", 0, 6)),
+        pytest.param(campaign(law=two_sets(HIRM), plant=LAGGING, limits=True, delta=Span(0.1, 0.15), gust=HARD, x0=0.1,
+                              samples=150, delays=delays("uniform", 0, 6)), marks=pytest.mark.long),
     ],
     ids=["hirm", "pendulum", "all at once"],
 )  # fmt: skip

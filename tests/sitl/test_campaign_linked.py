@@ -274,7 +274,7 @@ NO = (None, None)
     ("gains", "scenario", "ways", "preset"),
     [
         ("hirm-paper", "nominal", LOSSY, None),
-        ("hirm-paper", "nominal", JITTERY, None),
+        pytest.param("hirm-paper", "nominal", JITTERY, None, marks=LONG),
         ("pendulum-paper", "pendulum", BOTH, None),
         pytest.param("hirm-paper", "nominal", BURSTS, None, marks=LONG),
         pytest.param("hirm-paper", "nominal", OVERTAKING, None, marks=LONG),

@@ -93,7 +93,8 @@ def test_tasks_are_the_ranges_cut_at_whole_blocks(pieces: list[tuple[int, int]],
 
 @pytest.mark.parametrize("workers", [1, 2, 3])
 def test_threads_and_one_range_fly_the_same_to_the_last_bit(workers: int) -> None:
-    job, told = campaign(), []
+    job = campaign()
+    told: list[int] = []
     outcome = run(job, scheduler="none", workers=workers, told=told.append)
     assert equal(outcome.columns, fly_range(job, 0, job.flights))
     assert (outcome.flown, sum(told), outcome.workers) == (1000, 1000, workers)
