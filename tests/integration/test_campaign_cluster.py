@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import os
 from collections.abc import Iterator
 from pathlib import Path
@@ -15,6 +14,7 @@ from gains.table import InputError
 from sitl.campaign import cluster, tasks
 from sitl.campaign.run import run
 from sitl.link.presets import parse_link
+from tests.sitl.campaigns import local_cluster
 from tests.sitl.test_campaign_parts import campaign, equal, parts_in
 
 LINKED = {"delays": None, "link": parse_link("lte", None, None), "samples": 400}
@@ -23,13 +23,7 @@ LINKED = {"delays": None, "link": parse_link("lte", None, None), "samples": 400}
 
 @pytest.fixture(scope="module")
 def dask() -> Iterator[LocalCluster]:
-    with LocalCluster(
-        n_workers=2,
-        threads_per_worker=1,
-        host="127.0.0.1",
-        dashboard_address="127.0.0.1:0",
-        silence_logs=logging.CRITICAL,
-    ) as local:
+    with local_cluster() as local:
         yield local
 
 

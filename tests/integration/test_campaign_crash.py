@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import logging
 import os
 import re
 import signal
@@ -27,6 +26,7 @@ from sitl.campaign.job import Campaign
 from sitl.campaign.tasks import fly
 from sitl.link.presets import parse_link
 from tests.integration.programs import ENVIRONMENT, Program, alive, children_of, eventually, program
+from tests.sitl.campaigns import local_cluster
 from tests.sitl.test_campaign_parts import campaign, equal, parts_in
 
 LINE = ("sitl", "campaign", "--gains", "hirm-paper", "--link", "lte", "--json", "--flights")
@@ -39,13 +39,7 @@ def linked(flights: int, **changes: Any) -> Campaign:
 
 @pytest.fixture(scope="module")
 def dask() -> Iterator[LocalCluster]:
-    with LocalCluster(
-        n_workers=2,
-        threads_per_worker=1,
-        host="127.0.0.1",
-        dashboard_address="127.0.0.1:0",
-        silence_logs=logging.CRITICAL,
-    ) as local:
+    with local_cluster() as local:
         yield local
 
 

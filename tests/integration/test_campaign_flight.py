@@ -20,7 +20,7 @@ from gains.model import Gains, Matrix
 from gains.store import load_law, require_law
 from gains.witnessfile import read_witness
 from sitl.campaign.airframes import fly_one
-from sitl.campaign.distributions import Signal, Span, parse_delays, parse_signal
+from sitl.campaign.distributions import Signal, parse_delays, parse_signal
 from sitl.campaign.engine import Drawn, drawn_block, fly_range
 from sitl.campaign.job import Campaign
 from sitl.campaign.kernel import LANES, MAX_DELAY
@@ -31,6 +31,7 @@ from sitl.link.presets import parse_link
 from sitl.recorder import FlightRecorder
 from sitl.scenario import Scenario, load_scenario, stored_scenarios
 from sitl.summary import summarise
+from tests.sitl import campaigns
 
 SCENARIO = """
 title = "a flight of a campaign"
@@ -61,26 +62,20 @@ def campaign(
 ) -> Campaign:
     law = require_law(load_law(gains))
     d_min, d_max = window or (law.d_min, law.d_max)
-    base = Campaign(
-        law=law,
-        plant=law.model,
-        plant_name=law.model.name,
+    return campaigns.campaign(
+        gains,
         d_min=d_min,
         d_max=d_max,
         transitions="fifo" if fifo else "any",
         delays=parse_delays(delays, d_min, d_max, fifo=fifo, longest=MAX_DELAY),
-        link=None,
-        gust=parse_signal("sine:1deg..3deg:0.5s..5s", "gust"),
-        reference=Signal(),
-        delta=Span(0.0, 0.0),
-        x0=0.0,
-        wind=None,
-        limits=False,
-        flights=100,
-        samples=400,
-        seed=3,
+        **{
+            "gust": parse_signal("sine:1deg..3deg:0.5s..5s", "gust"),
+            "reference": Signal(),
+            "flights": 100,
+            "seed": 3,
+            **more,
+        },
     )
-    return replace(base, **more)
 
 
 def drawn_of(job: Campaign, flight: int) -> Drawn:

@@ -27,35 +27,12 @@ from sitl.campaign.job import Campaign
 from sitl.campaign.kernel import LANES, MAX_DELAY, set_of_delay
 from sitl.campaign.replaying import delays_of, growth_per_sample
 from sitl.linearizing import model_of
+from tests.sitl.campaigns import campaign
 
 DEG = math.pi / 180.0
 WORD = 2**32
 DELAY, HOLD, PARAMETERS, GUST = range(4)
 GUST_AT, REFERENCE_AT, DELTA_AT, X0_AT = 0, 16, 32, 48
-
-
-def campaign(gains: str = "hirm-paper", **changes: Any) -> Campaign:
-    law = require_law(load_law(gains))
-    base = Campaign(
-        law=law,
-        plant=law.model,
-        plant_name=law.model.name,
-        d_min=law.d_min,
-        d_max=law.d_max,
-        transitions="any",
-        delays=delays("uniform", law.d_min, law.d_max),
-        link=None,
-        gust=parse_signal("sine:0..3.5deg:0.5s..10s", "gust"),
-        reference=parse_signal("square:0..5deg:1s..10s", "reference"),
-        delta=Span(0.0, 0.0),
-        x0=0.0,
-        wind=None,
-        limits=False,
-        flights=1,
-        samples=400,
-        seed=1,
-    )
-    return replace(base, **changes)
 
 
 def delays(text: str, d_min: int = 1, d_max: int = 4, *, fifo: bool = False) -> DelayProcess:

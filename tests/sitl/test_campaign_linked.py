@@ -11,7 +11,6 @@ import pytest
 from numpy.typing import NDArray
 from scipy import stats
 
-from gains.store import load_law, require_law
 from sitl.campaign.distributions import Signal, Span
 from sitl.campaign.engine import fly_range
 from sitl.campaign.job import Campaign
@@ -22,6 +21,7 @@ from sitl.flight import fly_virtual
 from sitl.link.presets import parse_link
 from sitl.recorder import FlightRecorder
 from sitl.scenario import load_scenario
+from tests.sitl.campaigns import campaign
 
 Integers = NDArray[np.int64]
 MS = 1_000_000
@@ -30,29 +30,8 @@ MS = 1_000_000
 def over(
     up: str | None, down: str | None, gains: str = "hirm-paper", preset: str | None = None, **more: int
 ) -> Campaign:
-    law = require_law(load_law(gains))
-    return replace(
-        Campaign(
-            law=law,
-            plant=law.model,
-            plant_name=law.model.name,
-            d_min=law.d_min,
-            d_max=law.d_max,
-            transitions="any",
-            delays=None,
-            link=parse_link(preset, up, down),
-            gust=Signal("sine", Span(0.0, 0.06)),
-            reference=Signal(),
-            delta=Span(0.0, 0.0),
-            x0=0.0,
-            wind=None,
-            limits=False,
-            flights=1,
-            samples=400,
-            seed=1,
-        ),
-        **more,  # type: ignore[arg-type]
-    )
+    gust = Signal("sine", Span(0.0, 0.06))
+    return campaign(gains, delays=None, link=parse_link(preset, up, down), gust=gust, reference=Signal(), **more)
 
 
 def delays(job: Campaign, flights: int, start: int = 0) -> Integers:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +13,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gains.store import load_gains
 from gains.table import InputError
 from sitl.campaign import run as running
 from sitl.campaign.distributions import Span, parse_delays, parse_signal
@@ -23,30 +21,12 @@ from sitl.campaign.job import Campaign, identity
 from sitl.campaign.kernel import LANES, MAX_DELAY
 from sitl.campaign.parts import Part, Parts, missing_ranges
 from sitl.campaign.run import MAX_ROWS_KEPT, run
+from tests.sitl import campaigns
 
 
 def campaign(**changes: Any) -> Campaign:
-    law = load_gains("hirm-paper")
-    base = Campaign(
-        law=law,
-        plant=law.model,
-        plant_name="hirm",
-        d_min=1,
-        d_max=4,
-        transitions="any",
-        delays=parse_delays("uniform", 1, 4, fifo=False, longest=MAX_DELAY),
-        link=None,
-        gust=parse_signal("sine:0..3.5deg:0.5s..10s", "gust"),
-        reference=parse_signal("square:0..5deg:1s..10s", "reference"),
-        delta=Span(0.0, 0.0),
-        x0=0.0,
-        wind=None,
-        limits=False,
-        flights=1000,
-        samples=100,
-        seed=3,
-    )
-    return replace(base, **changes)
+    window = {"d_min": 1, "d_max": 4, "delays": parse_delays("uniform", 1, 4, fifo=False, longest=MAX_DELAY)}
+    return campaigns.campaign(**{**window, "flights": 1000, "samples": 100, "seed": 3, **changes})
 
 
 def parts_in(folder: Path, job: Campaign) -> Parts:

@@ -6,6 +6,7 @@ import json
 import math
 from collections import Counter
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -24,6 +25,7 @@ from sitl.campaign.job import Campaign
 from sitl.campaign.kernel import MAX_DELAY
 from sitl.campaign.splitting import LEAST, Descent, event_of, rare, split
 from sitl.commands.rare import rare_command
+from tests.sitl.campaigns import campaign
 
 Integers = NDArray[np.int64]
 
@@ -128,28 +130,9 @@ class Climb:
 # -- flights
 
 
-def hirm(**changes: object) -> Campaign:
-    law = require_law(load_law("hirm-paper"))
-    base = Campaign(
-        law=law,
-        plant=law.model,
-        plant_name="hirm",
-        d_min=1,
-        d_max=4,
-        transitions="any",
-        delays=parse_delays("geometric:3", 1, 4, fifo=False, longest=MAX_DELAY),
-        link=None,
-        gust=parse_signal("sine:0..3.5deg:0.5s..10s", "gust"),
-        reference=parse_signal("square:0..5deg:1s..10s", "reference"),
-        delta=Span(0.0, 0.0),
-        x0=0.0,
-        wind=None,
-        limits=False,
-        flights=1,
-        samples=100,
-        seed=1,
-    )
-    return replace(base, **changes)  # type: ignore[arg-type]
+def hirm(**changes: Any) -> Campaign:
+    delays = parse_delays("geometric:3", 1, 4, fifo=False, longest=MAX_DELAY)
+    return campaign(**{"d_min": 1, "d_max": 4, "delays": delays, "samples": 100, **changes})
 
 
 @pytest.mark.parametrize("transitions", ["any", "fifo"])
