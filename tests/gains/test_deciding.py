@@ -123,10 +123,10 @@ def test_a_loop_without_disturbance_and_reference_is_certified_without_eta(
 
 
 def test_people_are_told_eta_the_latency_and_the_sequence(capsys: pytest.CaptureFixture[str]) -> None:
-    code, out, _ = said(capsys, "certify", "hirm-paper", "--delay", "1:2", "--no-flown")
+    code, out, _ = said(capsys, "certify", "hirm-paper", "--delay", "1:1", "--no-flown")
     assert code == 0
-    assert "hirm-paper: stable for delays 1 to 2 (any), survives 50 ms" in out
-    assert "0.1315" in out
+    assert "hirm-paper: stable for delays 1 to 1 (any), survives 25 ms" in out
+    assert "0.1126" in out
     assert "verified" in out
     code, out, _ = said(capsys, "certify", "hirm-paper", "--delay", "1:5")
     assert code == 1
