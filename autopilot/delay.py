@@ -215,14 +215,16 @@ class DelayEstimator:
         upper = bisect_right(transits, transit_ns + CHANGE_TOLERANCE_NS)
         self._levels.append((lower + upper) / (2 * known) - 0.5)
         n = len(self._levels)
-        mean = abs(sum(self._levels)) / n
-        sigma = math.sqrt((1.0 / n + 1.0 / known) / 12.0)  # of two samples of one distribution (Mann and Whitney)
-        new = _at_one_end(self._levels)
-        changed = n == CHANGE_TRANSITS and mean > CHANGE_SIGMA * sigma
-        if new >= SUSPECT_TRANSITS if self._suspected else changed:
+        if self._suspected:
+            changed = _at_one_end(self._levels) >= SUSPECT_TRANSITS
+        else:
+            variance = (1.0 / n + 1.0 / known) / 12.0  # of two samples of one distribution (Mann and Whitney)
+            changed = n == CHANGE_TRANSITS and abs(sum(self._levels)) > n * CHANGE_SIGMA * math.sqrt(variance)
+        if changed:
             self.changes += 1
+            new = _at_one_end(self._levels)
             self._restart(new if new >= MIN_TRANSITS else n)
-        elif len(self._levels) == CHANGE_TRANSITS:
+        elif n == CHANGE_TRANSITS:
             self._suspected, self._in_doubt = False, 0  # commands travel otherwise now, TIMESYNC does not: a shift
 
     def sent(self, j: int, sample_ns: int, now_ns: int, forecast: DelayEstimate) -> None:
@@ -271,7 +273,7 @@ class DelayEstimator:
         if forecast_d is None or low is None or high is None:
             return
         self.scored += 1
-        weight = 1.0 / min(self.scored, SCORES)
+        weight = 1.0 / (self.scored if self.scored < SCORES else SCORES)
         covered = low <= d <= high
         self.exact += weight * ((forecast_d == d) - self.exact)
         self.covered += weight * (covered - self.covered)
@@ -360,10 +362,11 @@ class DelayEstimator:
 
     def forecast(self, sample_ns: int, now_ns: int) -> DelayEstimate:
         """Return d for a command leaving at ``now_ns`` (own) that used the sample stamped ``sample_ns`` (plant)."""
-        law, Ts_ns = self._law, self.Ts_ns
+        law, line, Ts_ns = self._law, self._line, self.Ts_ns
         if law is None or now_ns - self._heard_ns > STALE_NS:
             return UNKNOWN
-        age_ns = self._age_ns(sample_ns, now_ns)
+        # as _age_ns, which would cost a call
+        age_ns = now_ns + line.offset_ns + round((now_ns - line.t_ref_ns) * self._skew) - sample_ns
         transits, levels = law.transits, law.levels
         first = -(-(age_ns + transits[0]) // Ts_ns)
         last = -(-(age_ns + transits[-1]) // Ts_ns)
@@ -373,16 +376,20 @@ class DelayEstimator:
             first, last = 1, max(1, last)
         if first == last:
             return DelayEstimate(first, first, first, self._most(law, age_ns, first, first), self._status)
-        last = min(last, first + MAX_SPREAD)
+        if last > first + MAX_SPREAD:
+            last = first + MAX_SPREAD
         opened = law.open_at(age_ns)
         known = len(opened) - 1
         weights, total, before, limit_ns = [], 0.0, 0.0, first * Ts_ns - age_ns
-        for m in range(first, last + 1):
-            level = levels[bisect_right(transits, limit_ns)] if m < last else 1.0
+        for m in range(first, last):
+            level = levels[bisect_right(transits, limit_ns)]
             weight = (level - before) * opened[m if m < known else known]
             weights.append(weight)
             total += weight
             before, limit_ns = level, limit_ns + Ts_ns
+        weight = (1.0 - before) * opened[last if last < known else known]
+        weights.append(weight)
+        total += weight
         return self._summary(law, age_ns, first, weights, total)
 
     def _summary(self, law: TransitLaw, age_ns: int, first: int, weights: list[float], total: float) -> DelayEstimate:
@@ -403,8 +410,8 @@ class DelayEstimator:
                 break
             covered -= weights[end]
             low, high = (low + 1, high) if end == low else (low, high - 1)
-        probability = min(self._most(law, age_ns, first + low, first + high), covered / total)
-        return DelayEstimate(first + best, first + low, first + high, probability, self._status)
+        most, share = self._most(law, age_ns, first + low, first + high), covered / total
+        return DelayEstimate(first + best, first + low, first + high, most if most < share else share, self._status)
 
     def _most(self, law: TransitLaw, age_ns: int, low: int, high: int) -> float:
         """Return the most that n transits can say for an interval of delays: one more may lie beyond them all.

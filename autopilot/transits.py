@@ -111,7 +111,8 @@ class TransitLaw:
         """Return the open[m] of an age, all above 0; the last stands for every larger m."""
         if not self.open:
             return _ALL_OPEN
-        return self.open[min(max((age_ns - self.first_age_ns) // self.bin_ns, 0), len(self.open) - 1)]
+        bin_ = (age_ns - self.first_age_ns) // self.bin_ns
+        return self.open[bin_ if 0 <= bin_ < len(self.open) else 0 if bin_ < 0 else -1]
 
 
 def transit_law(transits: Ints, ages: Ints, reports: Reports, Ts_ns: int, density: Floats) -> TransitLaw:
