@@ -22,6 +22,7 @@ from autopilot.link.process import ADDRESS, Parsed, ProcessOptions, process_opti
 from autopilot.link.udp import Address, dial
 from autopilot.link.wire import Seal
 from autopilot.profile import parse_profile
+from autopilot.rehearsal import Rehearsal
 from gains.command import FiniteRange, run, version
 from gains.model import Schedule
 from gains.store import load_law
@@ -152,7 +153,9 @@ HOME = Parsed("HOME", parse_home)
 )
 @click.option("--accept-unsigned", "unsigned", multiple=True, help="A signed PORT that hears unsigned frames, too.")
 @click.option("--require-certificate", is_flag=True, help="Refuse gains without a verified certificate.")
-@click.option("--busy", is_flag=True, help="Never sleep: a processor of its own, and half the time to each command.")
+@click.option(
+    "--busy", is_flag=True, help="Never sleep: a processor of its own, and a command in less than half the time."
+)
 @process_options
 @click.version_option(version())
 def cli(
@@ -255,7 +258,18 @@ def _run(
         )
     banner = f"autopilot: gains {gains.name} ({proved}){scheduled}{also}, plant {plant[0]}:{plant[1]}"
     metadata = {"program": "autopilot", "gains": gains.name, "version": version()}
-    run_node("autopilot", node, openers, options, metadata, tap=True, banner=banner, keyring=keyring, busy=busy)
+    run_node(
+        "autopilot",
+        node,
+        openers,
+        options,
+        metadata,
+        tap=True,
+        banner=banner,
+        keyring=keyring,
+        busy=busy,
+        idle=Rehearsal(node.config).once if busy else None,
+    )
 
 
 def _seals(keyring: Keyring, keys: Sequence[str], unsigned: Sequence[str], stations: int) -> dict[str, Seal]:

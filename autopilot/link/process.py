@@ -152,6 +152,7 @@ def run_node(
     keyring: Keyring | None = None,
     spin_ns: int = 0,
     busy: bool = False,
+    idle: Callable[[], None] | None = None,
     at_end: Callable[[int], None] | None = None,
 ) -> None:
     """Run a node over UDP until Ctrl-C, SIGTERM or the end of the record stream.
@@ -180,6 +181,8 @@ def run_node(
         How long before a deadline the driver stops sleeping, as :class:`autopilot.link.udp.UdpDriver` takes it.
     busy : bool
         Whether it never sleeps, likewise.
+    idle : callable, optional
+        What it does then while nothing comes, likewise.
     at_end : callable, optional
         Called with the node's time when the loop has ended; what the node records then is recorded.
 
@@ -209,7 +212,9 @@ def run_node(
         sharpen_timers()
         gc.collect()
         gc.freeze()  # what is loaded now stays: no later collection has to look at it
-        driver = UdpDriver(node, ports, options.clock, sink, tap=tap, control=control, spin_ns=spin_ns, busy=busy)
+        driver = UdpDriver(
+            node, ports, options.clock, sink, tap=tap, control=control, spin_ns=spin_ns, busy=busy, idle=idle
+        )
         stack.callback(driver.close)
         driver.on_pass = _chores(driver, keyring, stream)
         driver.run(lambda: stopped or (stream is not None and stream.closed))

@@ -10,7 +10,8 @@ floods; what does not fit there the kernel drops and counts. Ground stations nee
 Sleeps end late, by tens of microseconds even on an idle machine. A driver with ``spin_ns`` therefore wakes that much
 before the node's deadline and looks at its ports, again and again, until the deadline has come. A ``busy`` driver never
 sleeps. A processor that slept answers late, and others have emptied its caches meanwhile: a datagram is answered in
-half the time, and a processor is taken for it. What the sockets themselves do is told in :mod:`autopilot.link.ports`.
+half the time, and a processor is taken for it. What such a driver does while nothing comes may keep the caches warm
+(:mod:`autopilot.rehearsal`). What the sockets themselves do is told in :mod:`autopilot.link.ports`.
 """
 
 from __future__ import annotations
@@ -45,6 +46,9 @@ MAX_WAIT_NS = NS_PER_S // 4
 
 MAX_SPIN_NS = 10 * NS_PER_MS
 """Longest spin before a deadline, and the most that is saved up for spinning."""
+
+IDLE_NS = 2 * NS_PER_MS
+"""Pause between what a busy driver does while nothing comes: so a packet seldom waits for the end of it."""
 
 SPIN_SHARE = 2
 """Spinning takes at most one part in so many of the time, or a dense flow of packets would keep a processor."""
@@ -90,6 +94,8 @@ class UdpDriver:
         ``MAX_SPIN_NS``.
     busy : bool
         Never to sleep.
+    idle : callable, optional
+        What a busy driver does now and then while nothing comes; a datagram that comes meanwhile waits for its end.
 
     Attributes
     ----------
@@ -110,6 +116,7 @@ class UdpDriver:
         on_pass: Callable[[int], None] | None = None,
         spin_ns: int = 0,
         busy: bool = False,
+        idle: Callable[[], None] | None = None,
     ) -> None:
         assert 0 <= spin_ns <= MAX_SPIN_NS, spin_ns
         self.node = node
@@ -119,6 +126,8 @@ class UdpDriver:
         self._last = -1
         self.on_pass = on_pass
         self._busy = busy
+        self._idle = idle
+        self._next_idle_ns = 0
         self._spin_ns = spin_ns
         self._spin_left_ns = spin_ns
         self._spin_seen_ns = true_ns()
@@ -204,8 +213,10 @@ class UdpDriver:
         """Look, without sleeping, until a datagram comes, it is due or ``MAX_WAIT_NS`` have passed."""
         now_ns = true_ns()
         until_ns = now_ns + MAX_WAIT_NS if due_ns is None else min(due_ns, now_ns + MAX_WAIT_NS)
-        while not (ready := self._look(0)) and true_ns() < until_ns:
-            pass
+        while not (ready := self._look(0)) and (now_ns := true_ns()) < until_ns:
+            if self._idle is not None and now_ns >= self._next_idle_ns:
+                self._idle()
+                self._next_idle_ns = true_ns() + IDLE_NS
         return ready
 
     def _may_spin_ns(self, now_ns: int) -> int:

@@ -18,6 +18,7 @@ from autopilot.link.clock import NS_PER_MS, NS_PER_S, NS_PER_US, Clock
 from autopilot.link.node import Record
 from autopilot.link.ports import LATCH_SILENCE_NS
 from autopilot.link.udp import (
+    IDLE_NS,
     MAX_PER_PASS,
     MAX_SPIN_NS,
     MAX_WAIT_NS,
@@ -528,6 +529,7 @@ def test_a_node_is_told_when_a_datagram_came_and_does_what_is_due_at_the_time_th
 LATE_NS = 60 * NS_PER_US
 """How late a sleep ends."""
 LOOK_NS = 2 * NS_PER_US
+IDLE_TAKES_NS = 80 * NS_PER_US
 SPIN_NS = 300 * NS_PER_US
 
 
@@ -567,6 +569,7 @@ class Sleeper(Probe):
         spin_ns: int = 0,
         *,
         busy: bool = False,
+        idle: Callable[[], None] | None = None,
     ) -> None:
         """Make passes; a datagram waits in the socket until its time has come."""
         self.deadline_ns = self.period_ns
@@ -574,7 +577,7 @@ class Sleeper(Probe):
         peer.sendto(b"x", port.local)
         monkeypatch.setattr(udp, "true_ns", lambda: self.now_ns)
         monkeypatch.setattr(select, "select", self.select)
-        with closing(UdpDriver(self, [port], Clock(), spin_ns=spin_ns, busy=busy)) as driver:
+        with closing(UdpDriver(self, [port], Clock(), spin_ns=spin_ns, busy=busy, idle=idle)) as driver:
             driver.run(passes(passes_made))
 
 
@@ -637,6 +640,30 @@ def test_a_busy_driver_without_a_deadline_soon_sees_that_it_shall_stop(monkeypat
     node.run(monkeypatch, peer, 2, busy=True)
     assert node.sleeps == []
     assert 2 * MAX_WAIT_NS <= node.now_ns <= 2 * (MAX_WAIT_NS + LOOK_NS)
+
+
+def test_a_busy_driver_has_something_to_do_while_nothing_comes(monkeypatch, peer):
+    node, began_ns = Sleeper(comes_ns=SAMPLE_NS // 2), []
+
+    def idle():
+        began_ns.append(node.now_ns)
+        node.now_ns += IDLE_TAKES_NS
+
+    node.run(monkeypatch, peer, 6, busy=True, idle=idle)
+    pauses_ns = [after - before - IDLE_TAKES_NS for before, after in itertools.pairwise(began_ns)]
+    assert len(began_ns) > 5 * SAMPLE_NS // (IDLE_NS + IDLE_TAKES_NS + LOOK_NS) - 6
+    assert min(pauses_ns) >= IDLE_NS
+    assert max(pauses_ns) <= IDLE_NS + 2 * LOOK_NS
+    ((_, _, now_ns),) = node.got
+    assert now_ns - SAMPLE_NS // 2 <= IDLE_TAKES_NS + LOOK_NS
+    assert max(node.late_ns) <= IDLE_TAKES_NS + LOOK_NS
+
+
+@pytest.mark.parametrize("spin_ns", [0, SPIN_NS])
+def test_a_driver_that_is_not_busy_is_never_idle(monkeypatch, peer, spin_ns):
+    calls = []
+    Sleeper().run(monkeypatch, peer, 5, spin_ns=spin_ns, idle=lambda: calls.append(1))
+    assert calls == []
 
 
 # what the node lives on
