@@ -16,7 +16,8 @@ for::
     0,2
     1,3
 
-Comments are ``# key: value`` in any order; keys that are not known are passed over.
+Comments are ``# key: value`` in any order; keys that are not known are passed over. A file without a growth is no
+witness of anything, just a sequence to be flown, such as the one that a recorded flight has lived.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ from typing import NoReturn
 
 from gains.table import InputError, read_content
 
-__all__ = ["MAX_PERIOD", "TRANSITIONS", "Witness", "read_witness", "write_witness"]
+__all__ = ["MAX_PERIOD", "TRANSITIONS", "Witness", "read_witness", "sequence_of", "write_witness"]
 
 MAX_PERIOD = 100_000
 """The longest period of a file, samples."""
@@ -39,8 +40,8 @@ MAX_PERIOD = 100_000
 TRANSITIONS = ("any", "fifo")
 """Which delay may follow which: any, or at most one sample more than the last."""
 
-_REQUIRED = ("Ts_s", "d_min", "d_max", "transitions", "growth_per_sample")
-_KNOWN = (*_REQUIRED, "gains", "model")
+_REQUIRED = ("Ts_s", "d_min", "d_max", "transitions")
+_KNOWN = (*_REQUIRED, "growth_per_sample", "gains", "model")
 _COLUMNS = "k,d"
 _ROW = re.compile(r"([0-9]{1,9}),([0-9]{1,9})")
 _INTEGER = re.compile(r"[0-9]{1,9}")
@@ -61,8 +62,9 @@ class Witness:
     transitions : "any" or "fifo"
         Which delay may follow which; under "fifo" d(k+1) <= d(k) + 1, from the last of a period to the first
         of the next too.
-    growth_per_sample : float
-        rho^(1/L) of the period's lifted product: by how much the loop grows from sample to sample.
+    growth_per_sample : float or None
+        rho^(1/L) of the period's lifted product: by how much the loop grows from sample to sample; None where nothing
+        is claimed.
     delays : tuple of int, length L
         d(0), ..., d(L-1), samples.
     """
@@ -73,8 +75,26 @@ class Witness:
     d_min: int
     d_max: int
     transitions: str
-    growth_per_sample: float
+    growth_per_sample: float | None
     delays: tuple[int, ...]
+
+
+def sequence_of(delays: tuple[int, ...], Ts: float, gains: str, model: str, growth: float | None = None) -> Witness:
+    """Return delays as a file holds them, one period as long as they are, in the window and order that they keep.
+
+    Parameters
+    ----------
+    delays : tuple of int
+        d(0), d(1), ..., samples.
+    Ts : float
+        Sampling period, s.
+    gains, model : str
+        Names of what it comes from.
+    growth : float, optional
+        What is claimed of it.
+    """
+    in_order = all(d <= before + 1 for before, d in pairwise((delays[-1], *delays)))
+    return Witness(gains, model, Ts, min(delays), max(delays), "fifo" if in_order else "any", growth, delays)
 
 
 def read_witness(path: str | Path) -> Witness:
@@ -110,7 +130,9 @@ def read_witness(path: str | Path) -> Witness:
         d_min=_integer(source, "d_min", values["d_min"]),
         d_max=_integer(source, "d_max", values["d_max"]),
         transitions=values["transitions"],
-        growth_per_sample=_number(source, "growth_per_sample", values["growth_per_sample"]),
+        growth_per_sample=(
+            _number(source, "growth_per_sample", values["growth_per_sample"]) if "growth_per_sample" in values else None
+        ),
         delays=_delays(source, rows[1:]),
     )
     _check(witness, source)
@@ -127,6 +149,7 @@ def write_witness(path: str | Path, witness: Witness) -> None:
     """
     source = str(path)
     _check(witness, source)
+    growth = witness.growth_per_sample
     lines = [
         "# lagproof witness",
         f"# gains: {witness.gains}",
@@ -135,7 +158,7 @@ def write_witness(path: str | Path, witness: Witness) -> None:
         f"# d_min: {witness.d_min}",
         f"# d_max: {witness.d_max}",
         f"# transitions: {witness.transitions}",
-        f"# growth_per_sample: {float(witness.growth_per_sample)!r}",
+        *([] if growth is None else [f"# growth_per_sample: {float(growth)!r}"]),
         _COLUMNS,
         *(f"{k},{d}" for k, d in enumerate(witness.delays)),
     ]
@@ -183,7 +206,7 @@ def _integer(source: str, key: str, text: str) -> int:
 def _check(witness: Witness, source: str) -> None:
     """Refuse a witness that is not one."""
     for key, value in (("Ts_s", witness.Ts), ("growth_per_sample", witness.growth_per_sample)):
-        if not (math.isfinite(value) and value > 0.0):
+        if value is not None and not (math.isfinite(value) and value > 0.0):
             _refuse(source, key, "a finite number above 0", repr(value))
     for key, name in (("gains", witness.gains), ("model", witness.model)):
         if not name.isprintable() or name != name.strip():

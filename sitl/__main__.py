@@ -25,6 +25,7 @@ COMMANDS = {
     "rare": "sitl.commands.rare:rare_command",
     "recover": "sitl.commands.recover:recover_command",
     "relay": "sitl.commands.relay:relay",
+    "replay": "sitl.commands.replay:replay",
     "report": "sitl.commands.report:report",
     "reproduce": "sitl.commands.reproduce:reproduce",
     "scenarios": "sitl.commands.fly:scenarios",

@@ -339,10 +339,10 @@ def _fault_text(fault: Mapping[str, Any]) -> str:
 
 def _witness_text(witness: Mapping[str, Any]) -> str:
     grown = "too short to tell" if witness["growth_per_sample"] is None else f"{witness['growth_per_sample']:.6f}"
-    return (
-        f"growth per sample {grown}, predicted {witness['predicted']:.6f};"
-        f" {witness['mismatches']} of {witness['prescribed_samples']} samples lived another delay"
-    )
+    lived = f"{witness['mismatches']} of {witness['prescribed_samples']} samples lived another delay"
+    if witness["predicted"] is None:
+        return lived
+    return f"growth per sample {grown}, predicted {witness['predicted']:.6f}; {lived}"
 
 
 def _claim(verdict: Verdict) -> str:

@@ -30,7 +30,7 @@ def witness_summary(witness: Witness, flight: FlightData, saturated: NDArray[np.
     """Return the numbers of a replayed witness, as they stand under ``witness`` in a summary.
 
     ``growth_error`` is |log(measured) / log(predicted) - 1|; measured and error are None where the flight is
-    too short to tell.
+    too short to tell, predicted and error where nothing is predicted.
 
     Parameters
     ----------
@@ -42,14 +42,16 @@ def witness_summary(witness: Witness, flight: FlightData, saturated: NDArray[np.
         Where the elevator stood at an end of its travel.
     """
     measured = growth_per_sample(len(witness.delays), flight, saturated)
-    log_predicted = math.log(witness.growth_per_sample)
-    known = measured is not None and log_predicted != 0.0
+    predicted = witness.growth_per_sample
+    error = None
+    if measured is not None and predicted is not None and predicted != 1.0:
+        error = abs(math.log(measured) / math.log(predicted) - 1.0)
     prescribed, missed = mismatches(witness, flight)
     return {
         "period": len(witness.delays),
-        "predicted": witness.growth_per_sample,
+        "predicted": predicted,
         "growth_per_sample": measured,
-        "growth_error": abs(math.log(measured) / log_predicted - 1.0) if known and measured is not None else None,
+        "growth_error": error,
         "prescribed_samples": prescribed,
         "mismatches": missed,
         "mismatch_fraction": missed / prescribed if prescribed else None,

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 
 from gains.switched import eq9, state_loop
-from gains.witnessfile import Witness, write_witness
+from gains.witnessfile import sequence_of, write_witness
 from sitl.campaign.engine import drawn_block
 from sitl.campaign.job import Campaign
 from sitl.campaign.kernel import LANES
@@ -47,18 +46,5 @@ def write_delays(path: Path, campaign: Campaign, flight: int, gains: str) -> Non
     InputError
         When the file cannot be written.
     """
-    delays = delays_of(campaign, flight)
-    in_order = all(d <= before + 1 for before, d in pairwise((delays[-1], *delays)))
-    write_witness(
-        path,
-        Witness(
-            gains=gains,
-            model=campaign.plant.name,
-            Ts=campaign.plant.Ts,
-            d_min=min(delays),
-            d_max=max(delays),
-            transitions="fifo" if in_order else "any",
-            growth_per_sample=growth_per_sample(campaign, delays),
-            delays=delays,
-        ),
-    )
+    delays, plant = delays_of(campaign, flight), campaign.plant
+    write_witness(path, sequence_of(delays, plant.Ts, gains, plant.name, growth_per_sample(campaign, delays)))

@@ -34,7 +34,7 @@ from sitl.programs import DEFAULT_PORT_BASE
 from sitl.scenario import Scenario, check_changes, load_scenario, stored_scenarios
 from sitl.summary import summary_table
 
-__all__ = ["fly_command", "scenarios"]
+__all__ = ["flight_options", "fly_and_tell", "fly_command", "ground_stations", "new_folder", "scenarios"]
 
 INTERRUPTED = 130
 
@@ -59,6 +59,34 @@ def _report(path: Path | None, name: str, start_ns: int, came_to: Outcome | str)
         write_junit(path, name, came_to.verdicts, came_to.summary, seconds)
 
 
+_FLIGHT_OPTIONS = (
+    click.option("--virtual", is_flag=True, help="In virtual time: one process, no socket, much faster."),
+    click.option("--failsafe", type=click.Choice(["on", "monitor"]), help="monitor: report, but fly the law."),
+    click.option("--out", type=click.Path(file_okay=False, path_type=Path), help="Folder for the files."),
+    click.option("--gcs", multiple=True, default=("udpout:127.0.0.1:14550",), show_default=True,
+                 help='Ground station; may be repeated; "none" for none.'),
+    click.option("--port-base", type=click.IntRange(0, 65_000), default=DEFAULT_PORT_BASE, show_default=True,
+                 help="The plant's port, the relay's is the next; 0 for any free ones."),
+    click.option("--json", "as_json", is_flag=True, help="Print the summary as one JSON object."),
+    click.option("--junit", type=FILE, callback=_in_a_folder, help="Write the checks as a JUnit report, too."),
+)  # fmt: skip
+
+
+def flight_options(command: Any) -> Any:
+    """Add to a click command what any flight can be told: how it flies, and where it goes."""
+    for option in reversed(_FLIGHT_OPTIONS):
+        command = option(command)
+    return command
+
+
+def ground_stations(gcs: Sequence[str]) -> tuple[str, ...]:
+    """Return the addresses of the ground stations, refused now rather than by a program."""
+    stations = tuple(address for address in gcs if address != "none")
+    for address in stations:
+        dial("gcs", ADDRESS.convert(address, None, None)).socket.close()
+    return stations
+
+
 @click.command("fly")
 @click.argument("scenario_name", metavar="[SCENARIO]", default="nominal")
 @click.option("--plant", "plant_name",
@@ -76,12 +104,7 @@ def _report(path: Path | None, name: str, start_ns: int, came_to: Outcome | str)
 @click.option("--wind", "wind_text", help="Turbulence and gusts, as in dryden:moderate+gust:5mps:100m@3s (README).")
 @click.option("--seed", type=SEED, help="Of everything random.")
 @click.option("--duration", type=FiniteRange(0.0, 86_400.0, min_open=True), help="Seconds.")
-@click.option("--virtual", is_flag=True, help="In virtual time: one process, no socket, much faster.")
 @click.option("--actuator", type=click.Choice(["pwm", "float"]), help="SERVO_OUTPUT_RAW or HIL_ACTUATOR_CONTROLS.")
-@click.option("--failsafe", type=click.Choice(["on", "monitor"]), help="monitor: report, but fly the law.")
-@click.option("--out", type=click.Path(file_okay=False, path_type=Path), help="Folder for the files.")
-@click.option("--gcs", multiple=True, default=("udpout:127.0.0.1:14550",), show_default=True,
-              help='Ground station; may be repeated; "none" for none.')  # fmt: skip
 @click.option("--reference", help="Another programmed reference than the scenario's (README).")
 @click.option("--alternative", "alternatives", multiple=True, help="Gains that a ground station may choose instead.")
 @click.option("--parameters", "parameters_file", type=FILE, help="File of the vehicle's parameters.")
@@ -94,10 +117,7 @@ def _report(path: Path | None, name: str, start_ns: int, came_to: Outcome | str)
     multiple=True,
     help="A fault more, as in kill:autopilot@5s+0.5s; may be repeated (docs/faults.md).",
 )
-@click.option("--port-base", type=click.IntRange(0, 65_000), default=DEFAULT_PORT_BASE, show_default=True,
-              help="The plant's port, the relay's is the next; 0 for any free ones.")  # fmt: skip
-@click.option("--json", "as_json", is_flag=True, help="Print the summary as one JSON object.")
-@click.option("--junit", type=FILE, callback=_in_a_folder, help="Write the checks as a JUnit report, too.")
+@flight_options
 def fly_command(
     scenario_name: str,
     plant_name: str | None,
@@ -125,21 +145,24 @@ def fly_command(
     """
     scenario = load_scenario(scenario_name, gains=gains_name, plant=plant_name)
     scenario = _changed(scenario, preset, up, down, changes)
-    stations = tuple(address for address in gcs if address != "none")
+    stations = ground_stations(gcs)
     if virtual and (wait_arm or key_file or gcs_key_file or alternatives or parameters_file):
         options = "--wait-arm, --key, --gcs-key, --alternative, --parameters"
         raise InputError(f"--virtual: expected none of {options}: there is no ground station in virtual time")
     if virtual and control is not None:
         raise InputError("--control: expected none with --virtual, which is over before anybody could ask: see --at")
-    for address in stations:
-        dial("gcs", ADDRESS.convert(address, None, None)).socket.close()  # refused now rather than by a program
     for path in filter(None, (key_file, gcs_key_file)):
         read_key(path)  # refused now rather than by a program
-    folder = out or _new_folder(f"{scenario.name}-{datetime.now():%Y%m%d-%H%M%S}")
+    folder = out or new_folder(scenario.name)
     ground = ["--wait-arm"] if wait_arm else []
     ground += [word for name in alternatives for word in ("--alternative", name)]
     ground += [] if parameters_file is None else ["--parameters", str(parameters_file)]
     flight = FlightOptions(virtual, folder, stations, port_base, tuple(ground), key_file, gcs_key_file, control)
+    return fly_and_tell(scenario, flight, as_json=as_json, junit=junit)
+
+
+def fly_and_tell(scenario: Scenario, flight: FlightOptions, *, as_json: bool, junit: Path | None) -> int:
+    """Fly, print what it came to, and return the exit status."""
     console = Console(stderr=True)
     start_ns = true_ns()
     try:
@@ -158,8 +181,9 @@ def fly_command(
     return SUCCESS if outcome.passed else NEGATIVE
 
 
-def _new_folder(name: str) -> Path:
-    """Make and return a folder below ``flights`` that no other flight has."""
+def new_folder(name: str) -> Path:
+    """Make and return a folder below ``flights`` that no other flight has: a name and the time of day."""
+    name = f"{name}-{datetime.now():%Y%m%d-%H%M%S}"
     for suffix in ("", *(f"-{n}" for n in range(2, 1000))):
         folder = Path("flights") / f"{name}{suffix}"
         try:

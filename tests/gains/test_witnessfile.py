@@ -84,10 +84,7 @@ def test_names_may_be_missing(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "complaint"),
     [
-        *(
-            (f"# {key}:", "# other:", f"{key}: ")
-            for key in ("Ts_s", "d_min", "d_max", "transitions", "growth_per_sample")
-        ),
+        *((f"# {key}:", "# other:", f"{key}: ") for key in ("Ts_s", "d_min", "d_max", "transitions")),
         ("# d_min: 1", "# d_min: 1\n# d_min: 1", "d_min: expected one value"),
         ("k,d\n", "", "columns: expected k,d"),
         ("k,d", "d,k", "columns: expected k,d"),

@@ -1,0 +1,162 @@
+"""A recorded flight flown again: its delay sequence d(k), and the scenario that lives it.
+
+The gate of the relay imposes the sequence (:mod:`sitl.link.gate`), so sample k of the aircraft holds a command as old
+as it was in the recording, whatever flies: another plant, other gains, another failsafe. Nothing else of the link is
+flown again; who wants the same packets late and lost writes ``--up trace=FILE#up --down trace=FILE#down``.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from autopilot.profile import parse_profile
+from gains.model import GainLaw, sets_of
+from gains.store import stored
+from gains.table import InputError
+from gains.witnessfile import sequence_of, write_witness
+from sitl.aircraft.wind import parse_wind
+from sitl.checks import Check
+from sitl.flightfile import FlightFile
+from sitl.link.gate import check_flyable
+from sitl.link.impairment import LinkSpec
+from sitl.scenario import Scenario, load_scenario, stored_scenarios
+
+__all__ = ["DELAYS_FILE", "MAX_MISMATCHES", "recorded_delays", "replay_of"]
+
+DELAYS_FILE = "delays.csv"
+
+_NONLINEAR = re.compile(r"(jsbsim|sixdof):[A-Za-z0-9][A-Za-z0-9_-]{0,63}")
+"""A plant that is no file. A recording may be anybody's, so it never chooses a path."""
+
+_STORED = {"gains": "stored gains", "plant": "a stored plant"}
+
+MAX_MISMATCHES = 0.01
+"""Share of the samples that may live another delay: over UDP, on a machine that is busy with other things, some do."""
+
+
+def recorded_delays(recorded: FlightFile, source: str) -> tuple[int, ...]:
+    """Return d(k) of every sample of a flight, from k = 0.
+
+    Before the first command a sample has no delay; d(k) = k + 1, the age of a command of sample -1, says the same: no
+    command is let through.
+
+    Raises
+    ------
+    InputError
+        When samples are missing, or the plant has restarted: its numbers then do not tell which sample is meant.
+    """
+    flight = recorded.flight
+    if (restarts := len(np.unique(flight.start)) - 1) > 0:
+        raise InputError(f"{source}: expected a flight in which the plant never restarted, found {restarts} restarts")
+    if not np.array_equal(flight.k, np.arange(len(flight.k))):
+        missing = np.setdiff1d(np.arange(int(flight.k[-1]) + 1), flight.k)
+        first = "another order" if not missing.size else f"sample {missing[0]} missing"
+        raise InputError(f"{source}: expected every sample from 0 on, found {first}")
+    return tuple(np.where(np.isnan(flight.d), flight.k + 1, flight.d).astype(np.int64).tolist())
+
+
+def replay_of(
+    recorded: FlightFile,
+    source: str,
+    folder: Path,
+    *,
+    scenario_name: str | None = None,
+    gains_name: str | None = None,
+    plant_name: str | None = None,
+    reference: str | None = None,
+) -> Scenario:
+    """Return the scenario that flies a recorded delay sequence again, and write the sequence into a folder.
+
+    Parameters
+    ----------
+    recorded : FlightFile
+        The flight.
+    source : str
+        Its file, for complaints.
+    folder : Path
+        Gets ``delays.csv``; it is there.
+    scenario_name, gains_name, plant_name, reference : str, optional
+        Others than the recording says.
+
+    Raises
+    ------
+    InputError
+        When the sequence cannot be told or flown, or what the recording names is not to be had any more as it was.
+    """
+    delays = recorded_delays(recorded, source)
+    said, law, model = recorded.metadata, recorded.law, recorded.flight.model
+    asked = scenario_name is not None
+    scenario_name = scenario_name or _stored_scenario(said.get("scenario", ""), source)
+    named = gains_name or _said(said, "gains", source)
+    scenario = load_scenario(scenario_name, gains=named, plant=plant_name or _said(said, "plant", source))
+    if not asked and said.get("title", scenario.title) != scenario.title:
+        raise InputError(f"{source}: flown by another scenario than the stored {scenario_name}; say --scenario FILE")
+    if gains_name is None and not _same_law(scenario.gains, law):
+        raise InputError(f"{source}: flown with other gains than the stored {named}; say --gains FILE")
+    reference = said.get("reference", scenario.reference) if reference is None else reference
+    if reference.startswith("file:") and reference == said.get("reference") != scenario.reference:
+        raise InputError(f"{source}: flown with a reference from a file; say --reference file:NAME")
+    parse_profile(reference, scenario.gains.model.Ts)
+    seed = said.get("seed", "")
+    sequence = sequence_of(delays, model.Ts, law.name, model.name)
+    path = folder / DELAYS_FILE
+    scenario = replace(
+        scenario,
+        title=f"{scenario.title}, with the delays of {recorded.name}",
+        duration_s=len(delays) * model.Ts,
+        seed=int(seed) if re.fullmatch(r"[0-9]{1,9}", seed) else scenario.seed,
+        reference=reference,
+        actuator="float" if said.get("actuator") == "float" else "pwm",
+        wind=parse_wind(said["wind"]) if "wind" in said else None,
+        latch="newest" if sequence.transitions == "fifo" else "last",
+        up=LinkSpec(),
+        down=LinkSpec(),
+        rules=(),
+        changes=(),
+        faults=(),
+        variants={},
+        checks=(Check("the aircraft lives the delays of the recording", "witness.mismatch_fraction", MAX_MISMATCHES),),
+        witness_name=str(path),
+        witness=sequence,
+    )
+    check_flyable(sequence, source, scenario.latch, scenario.plant)
+    write_witness(path, sequence)
+    return scenario
+
+
+def _stored_scenario(name: str, source: str) -> str:
+    """Return the name of a stored scenario."""
+    if name not in stored_scenarios():
+        raise InputError(f"{source}: expected a flight of a stored scenario, found {name[:40]!r}; say --scenario FILE")
+    return name
+
+
+def _said(metadata: Mapping[str, str], key: str, source: str) -> str:
+    """Return the gains or the plant that a recording names, where that is a stored one, or an aircraft."""
+    name = metadata.get(key, "")
+    if name not in {entry.name for entry in stored()} and not (key == "plant" and _NONLINEAR.fullmatch(name)):
+        raise InputError(f"{source}: expected a flight of {_STORED[key]}, found {name[:40]!r}; say --{key} FILE")
+    return name
+
+
+def _same_law(one: GainLaw, other: GainLaw) -> bool:
+    """Return whether two laws compute the same commands in the same windows."""
+
+    def told(law: GainLaw) -> list[tuple[object, ...]]:
+        return [
+            (
+                gains.d_min,
+                gains.d_max,
+                gains.K1.tobytes(),
+                None if gains.K2 is None else gains.K2.tobytes(),
+                repr(gains.controller),
+            )
+            for gains in sets_of(law)
+        ]
+
+    return told(one) == told(other) and np.array_equal(one.model.A, other.model.A)
