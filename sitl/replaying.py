@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from autopilot.profile import parse_profile
-from gains.model import GainLaw, sets_of
+from gains.model import GainLaw, Model, sets_of
 from gains.store import stored
 from gains.table import InputError
 from gains.witnessfile import sequence_of, write_witness
@@ -98,6 +98,8 @@ def replay_of(
         raise InputError(f"{source}: flown by another scenario than the stored {scenario_name}; say --scenario FILE")
     if gains_name is None and not _same_law(scenario.gains, law):
         raise InputError(f"{source}: flown with other gains than the stored {named}; say --gains FILE")
+    if gains_name is None and plant_name is None and not _same_plant(scenario.plant, model):
+        raise InputError(f"{source}: flown on another plant than the stored {scenario.plant.name}; say --plant FILE")
     reference = said.get("reference", scenario.reference) if reference is None else reference
     if reference.startswith("file:") and reference == said.get("reference") != scenario.reference:
         raise InputError(f"{source}: flown with a reference from a file; say --reference file:NAME")
@@ -159,4 +161,11 @@ def _same_law(one: GainLaw, other: GainLaw) -> bool:
             for gains in sets_of(law)
         ]
 
-    return told(one) == told(other) and np.array_equal(one.model.A, other.model.A)
+    return told(one) == told(other) and _same_plant(one.model, other.model)
+
+
+def _same_plant(one: Model, other: Model) -> bool:
+    """Return whether two models are one, as far as Eq. (4) goes."""
+    return one.Ts_ns == other.Ts_ns and all(
+        np.array_equal(getattr(one, name), getattr(other, name)) for name in ("A", "B", "E", "C", "D")
+    )

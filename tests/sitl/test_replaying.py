@@ -202,6 +202,7 @@ def _restarted(record: Record) -> Record | None:
         ),
         ({"gains": "hirm-d6"}, None, "flown with other gains than the stored hirm-d6; say --gains FILE"),
         ({"plant": "jsbsim:../../x"}, None, "expected a flight of a stored plant, found 'jsbsim:../../x'"),
+        ({"plant": "hirm-printed"}, None, "flown on another plant than the stored hirm-printed; say --plant FILE"),
         ({"plant": "/tmp/hirm.toml"}, None, "expected a flight of a stored plant"),
         ({"reference": "file:/etc/passwd"}, None, "flown with a reference from a file; say --reference file:NAME"),
         ({"reference": "nonsense"}, None, "nonsense"),
