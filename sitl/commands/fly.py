@@ -145,7 +145,6 @@ def fly_command(
     """
     scenario = load_scenario(scenario_name, gains=gains_name, plant=plant_name)
     scenario = _changed(scenario, preset, up, down, changes)
-    stations = ground_stations(gcs)
     if virtual and (wait_arm or key_file or gcs_key_file or alternatives or parameters_file):
         options = "--wait-arm, --key, --gcs-key, --alternative, --parameters"
         raise InputError(f"--virtual: expected none of {options}: there is no ground station in virtual time")
@@ -153,6 +152,7 @@ def fly_command(
         raise InputError("--control: expected none with --virtual, which is over before anybody could ask: see --at")
     for path in filter(None, (key_file, gcs_key_file)):
         read_key(path)  # refused now rather than by a program
+    stations = ground_stations(gcs)
     folder = out or new_folder(scenario.name)
     ground = ["--wait-arm"] if wait_arm else []
     ground += [word for name in alternatives for word in ("--alternative", name)]

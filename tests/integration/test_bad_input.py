@@ -91,12 +91,13 @@ def one_line(err: str, name: str) -> str:
 
 @pytest.fixture
 def no_socket(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let nobody open a socket."""
+    """Let nobody open a socket; still a class, for the modules that are imported meanwhile and derive from it."""
 
-    def refuse(*_arguments: object, **_more: object) -> None:
-        raise AssertionError("a socket was opened before the input was read")
+    class Refused(socket.socket):
+        def __init__(self, *_arguments: object, **_more: object) -> None:
+            raise AssertionError("a socket was opened before the input was read")
 
-    monkeypatch.setattr(socket, "socket", refuse)
+    monkeypatch.setattr(socket, "socket", Refused)
 
 
 @pytest.fixture
