@@ -10,7 +10,6 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 
@@ -18,7 +17,7 @@ from autopilot.profile import parse_profile
 from gains.model import GainLaw, Model, sets_of
 from gains.store import stored
 from gains.table import InputError
-from gains.witnessfile import sequence_of, write_witness
+from gains.witnessfile import Witness, sequence_of
 from sitl.aircraft.wind import parse_wind
 from sitl.checks import Check
 from sitl.flightfile import FlightFile
@@ -26,9 +25,7 @@ from sitl.link.gate import check_flyable
 from sitl.link.impairment import LinkSpec
 from sitl.scenario import Scenario, load_scenario, stored_scenarios
 
-__all__ = ["DELAYS_FILE", "MAX_MISMATCHES", "recorded_delays", "replay_of"]
-
-DELAYS_FILE = "delays.csv"
+__all__ = ["MAX_MISMATCHES", "recorded_sequence", "replay_of"]
 
 _NONLINEAR = re.compile(r"(jsbsim|sixdof):[A-Za-z0-9][A-Za-z0-9_-]{0,63}")
 """A plant that is no file. A recording may be anybody's, so it never chooses a path."""
@@ -39,8 +36,8 @@ MAX_MISMATCHES = 0.01
 """Share of the samples that may live another delay: over UDP, on a machine that is busy with other things, some do."""
 
 
-def recorded_delays(recorded: FlightFile, source: str) -> tuple[int, ...]:
-    """Return d(k) of every sample of a flight, from k = 0.
+def recorded_sequence(recorded: FlightFile, source: str) -> Witness:
+    """Return d(k) of every sample of a flight, from k = 0, as one period of a sequence.
 
     Before the first command a sample has no delay; d(k) = k + 1, the age of a command of sample -1, says the same: no
     command is let through.
@@ -50,27 +47,28 @@ def recorded_delays(recorded: FlightFile, source: str) -> tuple[int, ...]:
     InputError
         When samples are missing, or the plant has restarted: its numbers then do not tell which sample is meant.
     """
-    flight = recorded.flight
+    flight, model = recorded.flight, recorded.flight.model
     if (restarts := len(np.unique(flight.start)) - 1) > 0:
         raise InputError(f"{source}: expected a flight in which the plant never restarted, found {restarts} restarts")
     if not np.array_equal(flight.k, np.arange(len(flight.k))):
         missing = np.setdiff1d(np.arange(int(flight.k[-1]) + 1), flight.k)
         first = "another order" if not missing.size else f"sample {missing[0]} missing"
         raise InputError(f"{source}: expected every sample from 0 on, found {first}")
-    return tuple(np.where(np.isnan(flight.d), flight.k + 1, flight.d).astype(np.int64).tolist())
+    delays = np.where(np.isnan(flight.d), flight.k + 1, flight.d).astype(np.int64)
+    return sequence_of(tuple(delays.tolist()), model.Ts, recorded.law.name, model.name)
 
 
 def replay_of(
     recorded: FlightFile,
     source: str,
-    folder: Path,
+    sequence: Witness,
     *,
     scenario_name: str | None = None,
     gains_name: str | None = None,
     plant_name: str | None = None,
     reference: str | None = None,
 ) -> Scenario:
-    """Return the scenario that flies a recorded delay sequence again, and write the sequence into a folder.
+    """Return the scenario that flies a recorded delay sequence again; it is in no file yet that a relay could read.
 
     Parameters
     ----------
@@ -78,17 +76,16 @@ def replay_of(
         The flight.
     source : str
         Its file, for complaints.
-    folder : Path
-        Gets ``delays.csv``; it is there.
+    sequence : Witness
+        Its delays.
     scenario_name, gains_name, plant_name, reference : str, optional
         Others than the recording says.
 
     Raises
     ------
     InputError
-        When the sequence cannot be told or flown, or what the recording names is not to be had any more as it was.
+        When the sequence cannot be flown, or what the recording names is not to be had any more as it was.
     """
-    delays = recorded_delays(recorded, source)
     said, law, model = recorded.metadata, recorded.law, recorded.flight.model
     asked = scenario_name is not None
     scenario_name = scenario_name or _stored_scenario(said.get("scenario", ""), source)
@@ -105,12 +102,10 @@ def replay_of(
         raise InputError(f"{source}: flown with a reference from a file; say --reference file:NAME")
     parse_profile(reference, scenario.gains.model.Ts)
     seed = said.get("seed", "")
-    sequence = sequence_of(delays, model.Ts, law.name, model.name)
-    path = folder / DELAYS_FILE
     scenario = replace(
         scenario,
         title=f"{scenario.title}, with the delays of {recorded.name}",
-        duration_s=len(delays) * model.Ts,
+        duration_s=len(sequence.delays) * model.Ts,
         seed=int(seed) if re.fullmatch(r"[0-9]{1,9}", seed) else scenario.seed,
         reference=reference,
         actuator="float" if said.get("actuator") == "float" else "pwm",
@@ -123,11 +118,9 @@ def replay_of(
         faults=(),
         variants={},
         checks=(Check("the aircraft lives the delays of the recording", "witness.mismatch_fraction", MAX_MISMATCHES),),
-        witness_name=str(path),
         witness=sequence,
     )
     check_flyable(sequence, source, scenario.latch, scenario.plant)
-    write_witness(path, sequence)
     return scenario
 
 

@@ -9,13 +9,16 @@ from typing import Literal
 import click
 
 from gains.table import InputError
+from gains.witnessfile import Witness, write_witness
 from sitl.commands.fly import flight_options, fly_and_tell, ground_stations, new_folder
 from sitl.commands.options import FILE, SEED
 from sitl.flightfile import load_flight
 from sitl.programs import FlightOptions
-from sitl.replaying import replay_of
+from sitl.replaying import recorded_sequence, replay_of
 
-__all__ = ["replay"]
+__all__ = ["DELAYS_FILE", "replay"]
+
+DELAYS_FILE = "delays.csv"
 
 
 @click.command()
@@ -47,8 +50,29 @@ def replay(
     faults are not flown again, only what became of the commands.
     """
     recorded = load_flight(recording)
+    sequence = recorded_sequence(recorded, str(recording))
+    scenario = replay_of(
+        recorded,
+        str(recording),
+        sequence,
+        scenario_name=scenario_name,
+        gains_name=gains_name,
+        plant_name=plant_name,
+        reference=reference,
+    )
     stations = ground_stations(gcs)
     folder = out or new_folder(f"replay-{recorded.name}")
+    scenario = replace(
+        scenario,
+        seed=scenario.seed if seed is None else seed,
+        failsafe=failsafe or scenario.failsafe,
+        witness_name=_write_delays(sequence, folder, recording),
+    )
+    return fly_and_tell(scenario, FlightOptions(virtual, folder, stations, port_base), as_json=as_json, junit=junit)
+
+
+def _write_delays(sequence: Witness, folder: Path, recording: Path) -> str:
+    """Write a delay sequence into the folder of a flight, where the relay reads it, and return the file's name."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         overwritten = (folder / "flight.mcap").exists() and (folder / "flight.mcap").samefile(recording)
@@ -56,14 +80,5 @@ def replay(
         raise InputError(f"--out {folder}: {error.strerror or error}") from None
     if overwritten:
         raise InputError(f"--out {folder}: expected another folder than that of the recording")
-    scenario = replay_of(
-        recorded,
-        str(recording),
-        folder,
-        scenario_name=scenario_name,
-        gains_name=gains_name,
-        plant_name=plant_name,
-        reference=reference,
-    )
-    scenario = replace(scenario, seed=scenario.seed if seed is None else seed, failsafe=failsafe or scenario.failsafe)
-    return fly_and_tell(scenario, FlightOptions(virtual, folder, stations, port_base), as_json=as_json, junit=junit)
+    write_witness(folder / DELAYS_FILE, sequence)
+    return str(folder / DELAYS_FILE)

@@ -17,12 +17,12 @@ from gains.store import load_gains, model_path, save_gains, stored
 from gains.witnessfile import read_witness
 from sitl import replaying, scenario
 from sitl.__main__ import cli
+from sitl.commands.replay import DELAYS_FILE
 from sitl.flight import fly_virtual
 from sitl.flightdata import FlightData
 from sitl.flightfile import attachments_of, load_flight
 from sitl.link.gate import Gate
 from sitl.recorder import FlightRecorder
-from sitl.replaying import DELAYS_FILE
 from sitl.scenario import load_scenario
 
 SHORT_S = 4.0
@@ -215,7 +215,7 @@ def test_what_cannot_be_flown_again_is_one_line(
     recording = recorded(tmp_path / "first", metadata, rewrite or (lambda record: record))
     done = CliRunner().invoke(cli, ["replay", str(recording), "--virtual", "--out", str(tmp_path / "again")])
     assert complaint in str(done.exception)
-    assert not (tmp_path / "again" / "flight.mcap").exists()
+    assert not (tmp_path / "again").exists()
 
 
 def test_the_recording_itself_is_not_written_over(tmp_path: Path) -> None:
