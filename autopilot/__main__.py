@@ -153,9 +153,7 @@ HOME = Parsed("HOME", parse_home)
 )
 @click.option("--accept-unsigned", "unsigned", multiple=True, help="A signed PORT that hears unsigned frames, too.")
 @click.option("--require-certificate", is_flag=True, help="Refuse gains without a verified certificate.")
-@click.option(
-    "--busy", is_flag=True, help="Never sleep: a processor of its own, and a command in less than half the time."
-)
+@click.option("--busy", is_flag=True, help="Never sleep: it takes a processor of its own, and commands leave sooner.")
 @process_options
 @click.version_option(version())
 def cli(

@@ -9,8 +9,8 @@ floods; what does not fit there the kernel drops and counts. Ground stations nee
 
 Sleeps end late, by tens of microseconds even on an idle machine. A driver with ``spin_ns`` therefore wakes that much
 before the node's deadline and looks at its ports, again and again, until the deadline has come. A ``busy`` driver never
-sleeps. A processor that slept answers late, and others have emptied its caches meanwhile: a datagram is answered in
-half the time, and a processor is taken for it. What such a driver does while nothing comes may keep the caches warm
+sleeps. A processor that slept answers late, and others have emptied its caches meanwhile: a datagram is answered
+sooner, and a processor is taken for it. What such a driver does while nothing comes may keep the caches warm
 (:mod:`autopilot.rehearsal`). What the sockets themselves do is told in :mod:`autopilot.link.ports`.
 """
 
