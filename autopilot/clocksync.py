@@ -190,7 +190,8 @@ class ClockSync:
             self._contradict((ts1, tc1, now_ns), interval)
             return now_ns - ts1
         self._interval = met
-        self._contradicting.clear()
+        if self._contradicting:
+            self._contradicting.clear()
         self._since_step += 1
         fit = self._fit
         if fit is None or now_ns - fit.at_ns > WINDOW_NS or fit.allows(ts1, tc1, now_ns):

@@ -194,7 +194,7 @@ class DelayEstimator:
         """Take one TIMESYNC exchange: its request left at ts1 (own time) and arrived at tc1 (plant's time)."""
         if abs(tc1 - ts1) > MAX_TIME_NS:
             return
-        if self._transits.size and now_ns - max(self._transit_ns, self._heard_ns) > FORGET_NS:
+        if now_ns - self._heard_ns > FORGET_NS and now_ns - self._transit_ns > FORGET_NS and self._transits.size:
             self._restart(0)
         self._heard_ns = self._transit_ns = now_ns
         self._transits.append((ts1, tc1 - ts1))

@@ -49,7 +49,8 @@ class Window:
     @property
     def size(self) -> int:
         """Rows kept."""
-        return min(len(self._rows) + len(self._new), self._capacity)
+        rows = len(self._rows) + len(self._new)
+        return rows if rows < self._capacity else self._capacity
 
     def rows(self) -> NDArray[np.int64]:
         """Return all rows, oldest first."""
@@ -78,7 +79,9 @@ def without_stalls(exchanges: NDArray[np.int64]) -> NDArray[np.int64]:
     if len(exchanges) <= STALL_REQUESTS:
         return exchanges
     sent_ns, read_ns = exchanges[:, 0], exchanges.sum(axis=1)
-    together = np.abs(np.diff(read_ns)) < STALL_SHARE * np.diff(sent_ns)
+    together = np.abs(read_ns[1:] - read_ns[:-1]) < STALL_SHARE * (sent_ns[1:] - sent_ns[:-1])
+    if np.count_nonzero(together) < STALL_REQUESTS - 1:
+        return exchanges
     edges = np.flatnonzero(np.diff(np.concatenate([[0], together.view(np.int8), [0]])))
     keep = np.ones(len(exchanges), dtype=np.bool_)
     for begin, end in zip(edges[::2], edges[1::2], strict=True):
