@@ -205,4 +205,5 @@ def parse_span(
             if least <= low <= high <= most:
                 return Span(low, high)
     known = ", ".join(unit for unit in units if unit)
-    raise InputError(f'{what}: expected a number or LOW..HIGH with its unit ({known}), found "{text}"')
+    with_unit = f" with its unit ({known})" if known else ""
+    raise InputError(f'{what}: expected a number or LOW..HIGH{with_unit}, found "{text}"')
