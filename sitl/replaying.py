@@ -17,7 +17,7 @@ from autopilot.profile import parse_profile
 from gains.model import GainLaw, Model, sets_of
 from gains.store import stored
 from gains.table import InputError
-from gains.witnessfile import Witness, sequence_of
+from gains.witnessfile import MAX_PERIOD, Witness, sequence_of
 from sitl.aircraft.wind import parse_wind
 from sitl.checks import Check
 from sitl.flightfile import FlightFile
@@ -45,7 +45,8 @@ def recorded_sequence(recorded: FlightFile, source: str) -> Witness:
     Raises
     ------
     InputError
-        When samples are missing, or the plant has restarted: its numbers then do not tell which sample is meant.
+        When samples are missing, or the plant has restarted: its numbers then do not tell which sample is meant; when
+        there are more than ``MAX_PERIOD``, which no file of a sequence holds.
     """
     flight, model = recorded.flight, recorded.flight.model
     if (restarts := len(np.unique(flight.start)) - 1) > 0:
@@ -54,6 +55,8 @@ def recorded_sequence(recorded: FlightFile, source: str) -> Witness:
         missing = np.setdiff1d(np.arange(int(flight.k[-1]) + 1), flight.k)
         first = "another order" if not missing.size else f"sample {missing[0]} missing"
         raise InputError(f"{source}: expected every sample from 0 on, found {first}")
+    if len(flight.k) > MAX_PERIOD:
+        raise InputError(f"{source}: expected at most {MAX_PERIOD} samples, found {len(flight.k)}")
     delays = np.where(np.isnan(flight.d), flight.k + 1, flight.d).astype(np.int64)
     return sequence_of(tuple(delays.tolist()), model.Ts, recorded.law.name, model.name)
 

@@ -181,6 +181,10 @@ def _without_sample_7(record: Record) -> Record | None:
     return None if record.topic == "plant/truth" and record.body["k"] == 7 else record
 
 
+def _without_samples(record: Record) -> Record | None:
+    return None if record.topic == "plant/truth" else record
+
+
 def _restarted(record: Record) -> Record | None:
     if record.topic != "plant/truth" or record.body["k"] < 20:
         return record
@@ -191,6 +195,7 @@ def _restarted(record: Record) -> Record | None:
     ("metadata", "rewrite", "complaint"),
     [
         ({}, _without_sample_7, "expected every sample from 0 on, found sample 7 missing"),
+        ({}, _without_samples, "expected samples of a plant (plant/truth), found none"),
         ({}, _restarted, "expected a flight in which the plant never restarted, found 1"),
         ({"scenario": "mine"}, None, "expected a flight of a stored scenario, found 'mine'; say --scenario FILE"),
         ({"scenario": "/etc/passwd"}, None, "expected a flight of a stored scenario"),
@@ -215,6 +220,15 @@ def test_what_cannot_be_flown_again_is_one_line(
     recording = recorded(tmp_path / "first", metadata, rewrite or (lambda record: record))
     done = CliRunner().invoke(cli, ["replay", str(recording), "--virtual", "--out", str(tmp_path / "again")])
     assert complaint in str(done.exception)
+    assert not (tmp_path / "again").exists()
+
+
+def test_a_flight_too_long_for_a_sequence_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    recording = recorded(tmp_path / "first")
+    samples = len(load_flight(recording).flight.k)
+    monkeypatch.setattr(replaying, "MAX_PERIOD", samples - 1)
+    done = CliRunner().invoke(cli, ["replay", str(recording), "--virtual", "--out", str(tmp_path / "again")])
+    assert f"expected at most {samples - 1} samples, found {samples}" in str(done.exception)
     assert not (tmp_path / "again").exists()
 
 
