@@ -251,17 +251,23 @@ def _part(part: str, text: str) -> DrydenSpec | GustSpec:
     if kind == "dryden":
         if rest in SEVERITIES:
             return DrydenSpec(rest)
+        if not rest[:1].isdigit():
+            raise _no_wind(text, part)
         return DrydenSpec(_number(rest, "mps", text, above=0.0))
     way, at, start = rest.partition("@")
     words = way.split(":")
     if kind != "gust" or len(words) != 3 or words[0] not in AXES:
-        known = ", ".join(SEVERITIES)
-        raise InputError(
-            f'wind "{text}": expected dryden:1.5mps, dryden: and one of {known}, or gust:w:5mps:100m@3s,'
-            f" found {part or 'nothing'}"
-        )
+        raise _no_wind(text, part)
     speed, length = _number(words[1], "mps", text), _number(words[2], "m", text, above=0.0)
     return GustSpec(words[0], speed, length, parse_time_ns(start, f'wind "{text}"') if at else 0)
+
+
+def _no_wind(text: str, part: str) -> InputError:
+    known = ", ".join(SEVERITIES)
+    return InputError(
+        f'wind "{text}": expected dryden:1.5mps, dryden: and one of {known}, or gust:w:5mps:100m@3s,'
+        f" found {part or 'nothing'}"
+    )
 
 
 def _number(word: str, unit: str, text: str, *, above: float = -math.inf) -> float:

@@ -35,7 +35,7 @@ from sitl.campaign.philox import SPLIT, words
 __all__ = ["MAX_CELLS", "FlightPaths", "Tails", "tails_of"]
 
 MAX_CELLS = 1 << 24
-"""Paths times samples that are kept at once: some 40 bytes each with one gust and one reference."""
+"""Paths times samples that are kept at once, over all threads: some 40 bytes each with one gust and one reference."""
 
 _HALF = np.uint64(32)
 _REPLICA = 8

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import logging
 import re
+import socket
+import struct
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from typing import Any
@@ -11,12 +13,38 @@ from typing import Any
 from gains.command import version
 from gains.table import InputError
 
-__all__ = ["connected"]
+__all__ = ["connected", "require_scheduler"]
 
-_ADDRESS = re.compile(r"(tcp|tls)://(\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9.-]+):[0-9]{1,5}")
+_ADDRESS = re.compile(r"tcp://(\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9.-]+):([0-9]{1,5})")
 
 PATIENCE_S = 15.0
 """For a scheduler to answer, and for its first worker."""
+
+_GREETING, _LONGEST_GREETING = struct.Struct("Q"), 1 << 20
+"""What Dask sends first over tcp: the length in bytes of its handshake, which comes unasked."""
+
+
+def require_scheduler(address: str) -> None:
+    """Refuse an address where nothing greets as a Dask scheduler does, at once and on one line.
+
+    Dask itself takes the first bytes of whatever is there for a length, and waits for so many or wants room for them.
+
+    Raises
+    ------
+    InputError
+    """
+    match = _ADDRESS.fullmatch(address)
+    if match is None:
+        raise InputError(f'scheduler "{address}": expected local, none or tcp://HOST:PORT')
+    _require_dask()
+    try:
+        with socket.create_connection((match[1].strip("[]"), int(match[2])), PATIENCE_S) as peer:
+            peer.settimeout(PATIENCE_S)
+            greeting = peer.recv(_GREETING.size, socket.MSG_WAITALL)
+    except (OSError, OverflowError, UnicodeError) as error:
+        raise InputError(f'scheduler "{address}": expected one with workers, found: {_said(error)}') from None
+    if len(greeting) < _GREETING.size or not 0 < _GREETING.unpack(greeting)[0] < _LONGEST_GREETING:
+        raise InputError(f'scheduler "{address}": expected a Dask scheduler, found something else')
 
 
 @contextmanager
@@ -35,12 +63,11 @@ def connected(address: str | None, workers: int) -> Iterator[Any]:
     InputError
         When nobody answers, no worker is there, or one has not the same version of this package.
     """
-    if address is not None and not _ADDRESS.fullmatch(address):  # some of what is none keeps Dask waiting for ever
-        raise InputError(f'scheduler "{address}": expected local, none or tcp://HOST:PORT')
-    try:
-        from distributed import Client, LocalCluster
-    except ImportError:
-        raise InputError("campaign: expected Dask (pip install 'lagproof[campaign]'), found none") from None
+    if address is not None:
+        require_scheduler(address)
+    _require_dask()
+    from distributed import Client, LocalCluster
+
     with ExitStack() as stack:
         _silence(logging.getLogger("distributed.client"), stack)
         if address is None:
@@ -67,6 +94,13 @@ def connected(address: str | None, workers: int) -> Iterator[Any]:
                 f'scheduler "{address}": expected workers of lagproof {version()}, found {", ".join(sorted(found))}'
             )
         yield client
+
+
+def _require_dask() -> None:
+    try:
+        import distributed  # noqa: F401
+    except ImportError:
+        raise InputError("campaign: expected Dask (pip install 'lagproof[campaign]'), found none") from None
 
 
 def _silence(logger: logging.Logger, stack: ExitStack) -> None:

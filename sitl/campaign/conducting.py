@@ -13,16 +13,18 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from gains.atomic import replace_file
 from gains.certificate import model_hash
+from gains.model import Model
 from gains.table import InputError
 from sitl.aircraft.plants import is_nonlinear
 from sitl.campaign.bounds import Bound, certified_bound
+from sitl.campaign.cluster import require_scheduler
 from sitl.campaign.comparison import MAX_CONTROLLERS, Comparison, compare
 from sitl.campaign.engine import Columns
 from sitl.campaign.job import Campaign, identity
 from sitl.campaign.page import campaign_page
 from sitl.campaign.parts import Parts
 from sitl.campaign.replaying import growth_per_sample, write_delays
-from sitl.campaign.run import Outcome, run
+from sitl.campaign.run import WITHOUT_SCHEDULER, Outcome, run
 from sitl.campaign.statistics import Statistics, measure
 from sitl.campaign.tables import campaign_tables, comparison_tables
 
@@ -37,6 +39,7 @@ class Flown:
     job: Campaign
     bound: Bound
     outcome: Outcome
+    aside: int
 
     @property
     def columns(self) -> Columns:
@@ -79,9 +82,12 @@ def conduct(
     Raises
     ------
     InputError
-        For too many to compare, two that would share a folder, and what :func:`sitl.campaign.run.run` refuses.
+        For too many to compare, two that would share a folder, no scheduler at its address, and what
+        :func:`sitl.campaign.run.run` refuses.
     """
     _check_names(list(jobs), folder)
+    if scheduler not in WITHOUT_SCHEDULER:
+        require_scheduler(scheduler)
     console = Console(stderr=True)
     flown = []
     bar = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
@@ -99,7 +105,7 @@ def conduct(
                 parts=parts,
                 told=lambda n, task=task: progress.advance(task, n),  # type: ignore[misc]
             )
-            flown.append(Flown(name, job, bound, outcome))
+            flown.append(Flown(name, job, bound, outcome, 0 if parts is None else parts.aside))
     comparison = None
     if len(flown) > 1:
         etas = {one.name: one.bound.eta for one in flown}
@@ -150,9 +156,23 @@ def describe(name: str, job: Campaign, delays: str, bound: Bound) -> dict[str, A
         "flights": job.flights,
         "seed": job.seed,
         "Ts": job.plant.Ts,
+        "unit": _unit_of(job.plant),
         "eta": bound.eta,
         "eta_source": bound.source,
     }
+
+
+def _unit_of(plant: Model) -> str:
+    """Return the unit of the outputs where each of them is a state, whose name says it; "" where that is not known."""
+    units = {"_rad": "rad", "_rad_s": "rad/s", "_m": "m", "_m_s": "m/s"}
+    found = set()
+    for row in np.hstack((plant.C, plant.D)):
+        [*chosen] = np.flatnonzero(row)
+        if len(chosen) != 1 or chosen[0] >= plant.nx or row[chosen[0]] != 1.0:
+            return ""
+        name = plant.states[chosen[0]]
+        found.add(next((units[end] for end in sorted(units, key=len, reverse=True) if name.endswith(end)), ""))
+    return found.pop() if len(found) == 1 else ""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -227,9 +247,11 @@ def _sentence(flown: Flown) -> str:
     outcome = flown.outcome
     if not outcome.flown:
         return "All flights were there already."
+    by = "1 worker" if outcome.workers == 1 else f"{outcome.workers} workers"
+    aside = f" Files that were damaged or of no use, put aside as _aside-…: {flown.aside}." if flown.aside else ""
     return (
-        f"{outcome.flown:,} flights flown in {outcome.seconds:.1f} s by {outcome.workers} workers:"
-        f" {flown.steps_per_s / 1e6:.3g} million plant-steps/s."
+        f"{outcome.flown:,} flights flown in {outcome.seconds:.1f} s by {by}:"
+        f" {flown.steps_per_s / 1e6:.3g} million plant-steps/s.{aside}"
     )
 
 
@@ -262,6 +284,7 @@ def _numbers(flown: Flown, measured: Statistics) -> dict[str, Any]:
         "growth_per_sample": _growth(flown),
         "worst_flight": worst_flight(columns),
         "flown_now": outcome.flown,
+        "put_aside": flown.aside,
         "workers": outcome.workers,
         "seconds": outcome.seconds,
         "plant_steps_per_s": flown.steps_per_s,
@@ -269,11 +292,15 @@ def _numbers(flown: Flown, measured: Statistics) -> dict[str, Any]:
     }
 
 
-def _growth(flown: Flown) -> dict[str, float] | None:
-    """Return the growth that a cycle predicts for ever, and the median of what the flights' second halves did."""
+def _growth(flown: Flown) -> dict[str, float | None] | None:
+    """Return the growth that a cycle predicts for ever, and the median of what the flights' second halves did.
+
+    Measured is the largest |x| so far, which cannot fall: nothing is measured of a loop that does not grow.
+    """
     delays = flown.job.delays
     if delays is None or not delays.cycle:
         return None
-    measured = flown.columns["growth"]
-    median = float(np.median(measured[np.isfinite(measured)])) if np.isfinite(measured).any() else float("nan")
-    return {"predicted": growth_per_sample(flown.job, delays.cycle), "measured": median}
+    predicted, measured = growth_per_sample(flown.job, delays.cycle), flown.columns["growth"]
+    known = measured[np.isfinite(measured)]
+    grows = len(known) > 0 and (predicted is None or predicted > 1.0)
+    return {"predicted": predicted, "measured": float(np.median(known)) if grows else None}

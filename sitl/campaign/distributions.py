@@ -187,7 +187,7 @@ def parse_signal(text: str, what: str) -> Signal:
 def parse_span(
     text: str, what: str, units: dict[str, float] = _UNITS, least: float = 0.0, most: float = LARGEST
 ) -> Span:
-    """Return the span that a text names; where only its end has a unit, that counts for both.
+    """Return the span that a text names; a unit at its end alone counts for both, its start cannot have one alone.
 
     Raises
     ------
@@ -200,10 +200,12 @@ def parse_span(
         if last is None:
             last, unit = first, first_unit
         scales = units.get(first_unit or unit), units.get(unit)
-        if None not in scales:
+        if None not in scales and (unit or not first_unit):
             low, high = (float(number) * scale for number, scale in zip((first, last), scales, strict=True) if scale)
             if least <= low <= high <= most:
                 return Span(low, high)
     known = ", ".join(unit for unit in units if unit)
     with_unit = f" with its unit ({known})" if known else ""
-    raise InputError(f'{what}: expected a number or LOW..HIGH{with_unit}, found "{text}"')
+    raise InputError(
+        f'{what}: expected a number from {least:g} to {most:g}, or LOW..HIGH{with_unit}, LOW first, found "{text}"'
+    )

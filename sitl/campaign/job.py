@@ -7,11 +7,15 @@ campaigns with the same identity flight n is the same flight, to the last bit.
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, is_dataclass
+from typing import Any
 
-from gains.certificate import law_hash, model_hash
-from gains.model import GainLaw, Model
+import numpy as np
+
+from gains.model import GainLaw, Model, sets_of
 from gains.switched import Transitions
+from sitl.aircraft.plants import is_nonlinear
 from sitl.aircraft.wind import WindSpec
 from sitl.campaign.distributions import DelayProcess, Signal, Span
 from sitl.link.impairment import LinkSpec
@@ -21,7 +25,7 @@ __all__ = ["MAX_FLIGHTS", "MAX_SAMPLES", "Campaign", "identity"]
 MAX_FLIGHTS = 10**12
 MAX_SAMPLES = 10**6
 
-FORMAT = 2
+FORMAT = 3
 """Of what is drawn how: a campaign that was begun with another one is not gone on with."""
 
 
@@ -81,15 +85,50 @@ class Campaign:
 
 
 def identity(campaign: Campaign) -> str:
-    """Return what tells campaigns of other flights apart, 64 hexadecimal digits; how many are flown does not count."""
+    """Return what tells campaigns of other flights apart, 64 hexadecimal digits; how many are flown does not count.
+
+    All that a flight is computed from counts, to the last bit: the plant with its actuator and trim, the gains, the
+    reference model, and of a ``sixdof:`` aircraft the numbers of its file (of a ``jsbsim:`` one its name alone). Names
+    of models, certificates, and how an option was worded do not.
+    """
+    law, delays = campaign.law, campaign.delays
     drawn = (
-        campaign.plant_name,
         (campaign.d_min, campaign.d_max, campaign.transitions),
-        None if campaign.delays is None else (campaign.delays.weights, campaign.delays.d_min, campaign.delays.hold),
-        None if campaign.delays is None else (campaign.delays.fifo, campaign.delays.cycle),
-        repr(campaign.link),
-        tuple((signal.kind, *signal.amplitude, *signal.period_s) for signal in (campaign.gust, campaign.reference)),
-        (*campaign.delta, campaign.x0, repr(campaign.wind), campaign.limits, campaign.samples, campaign.seed),
+        None if delays is None else (delays.weights, delays.d_min, delays.hold, delays.fifo, delays.cycle),
+        campaign.link,
+        (campaign.gust, campaign.reference, campaign.delta, campaign.x0),
+        (campaign.wind, campaign.limits, campaign.samples, campaign.seed),
     )
-    hashed = (FORMAT, law_hash(campaign.law), model_hash(campaign.law.model), model_hash(campaign.plant), drawn)
-    return hashlib.sha256(repr(hashed).encode()).hexdigest()
+    flown = (
+        campaign.plant_name if is_nonlinear(campaign.plant_name) else "linear",
+        _aircraft(campaign.plant_name),
+        campaign.plant,
+        law.model,
+        [(gains.d_min, gains.d_max, gains.K1, gains.K2, gains.controller) for gains in sets_of(law)],
+    )
+    return hashlib.sha256(repr(_plain((FORMAT, drawn, flown))).encode()).hexdigest()
+
+
+def _aircraft(plant_name: str) -> Any:
+    """Return the numbers of a ``sixdof:`` aircraft, which the plant's model does not say."""
+    kind, _, name = plant_name.partition(":")
+    if kind != "sixdof" or not name:
+        return None
+    from sitl.aircraft.aerodynamics import load_aircraft
+
+    return load_aircraft(name)
+
+
+def _plain(value: Any) -> Any:
+    """Return nested tuples of texts and numbers, exact, that are the same for the same data; models lose their name."""
+    if isinstance(value, np.ndarray):
+        return value.shape, _plain(value.tolist())
+    if is_dataclass(value):
+        kept = [field.name for field in fields(value) if not (isinstance(value, Model) and field.name == "name")]
+        return type(value).__name__, *((name, _plain(getattr(value, name))) for name in kept)
+    if isinstance(value, Mapping):
+        return tuple(sorted((str(key), _plain(item)) for key, item in value.items()))
+    if isinstance(value, tuple | list):
+        return tuple(map(_plain, value))
+    assert value is None or isinstance(value, str | int | float), type(value)
+    return float(value) if isinstance(value, float) else value

@@ -65,7 +65,9 @@ def campaign_page(
             _paragraphs(words.concluded(description, told)),
             after=f"<h3>And what not</h3>{_paragraphs(words.not_concluded(description))}",
         ),
-        Section("Failures", table_html(words.failures(told), "Flights, and how probable such flights are")),
+        Section(
+            "Failures", table_html(words.failures(description, told), "Flights, and how probable such flights are")
+        ),
         Section("Gain", panels=(gain_panel(told.gains),)),
         Section(
             "Errors",

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -51,6 +51,11 @@ class Parts:
     description : mapping
         What is written beside the parts.
 
+    Attributes
+    ----------
+    aside : int
+        Files that were put aside.
+
     Raises
     ------
     InputError
@@ -59,6 +64,7 @@ class Parts:
 
     def __init__(self, folder: Path, identity: str, description: Mapping[str, Any]) -> None:
         self.folder = folder
+        self.aside = 0
         self._parts: list[Part] = []
         try:
             folder.mkdir(parents=True, exist_ok=True)
@@ -83,8 +89,12 @@ class Parts:
             raise InputError(f"{self.folder}: expected an empty folder or one with {DESCRIPTION}, found other files")
         replace_file(path, orjson.dumps({**description, "identity": identity}, option=orjson.OPT_INDENT_2))
 
-    def found(self) -> list[Part]:
-        """Return the whole parts, in the order of flights; damaged ones, and what overlaps an earlier one, go aside."""
+    def found(self, names: Collection[str]) -> list[Part]:
+        """Return the whole parts, in the order of flights.
+
+        What is damaged, overlaps an earlier one, or has other flights or columns than its name and ``names`` say, is
+        put aside and counted.
+        """
         parts: list[Part] = []
         self._parts = parts
         for path in sorted(self.folder.iterdir()):
@@ -92,10 +102,11 @@ class Parts:
             if match is None:
                 continue
             start, stop = int(match[1]), int(match[2])
-            if (not parts or start >= parts[-1].stop) and _rows(path) == stop - start > 0:
+            if (not parts or start >= parts[-1].stop) and _is_whole(path, start, stop, names):
                 parts.append(Part(start, stop, path))
             else:
                 path.replace(path.with_name(f"_aside-{path.name}"))
+                self.aside += 1
         return list(parts)
 
     def write(self, start: int, stop: int, columns: Columns) -> None:
@@ -124,12 +135,15 @@ class Parts:
                 yield {name: np.asarray(table[name]) for name in table.column_names}
 
 
-def _rows(path: Path) -> int:
-    """Return how many rows a file has; -1 for one that is damaged anywhere."""
+def _is_whole(path: Path, start: int, stop: int, names: Collection[str]) -> bool:
+    """Return whether a file can be read, and has these flights and columns."""
     try:
-        return int(pq.read_table(path, page_checksum_verification=True).num_rows)
+        table = pq.read_table(path, page_checksum_verification=True)
     except (OSError, pa.ArrowException):
-        return -1
+        return False
+    if set(table.column_names) != set(names) or not 0 < stop - start == table.num_rows:
+        return False
+    return np.array_equal(np.asarray(table["flight"]), np.arange(start, stop))
 
 
 def missing_ranges(parts: list[Part], flights: int) -> list[tuple[int, int]]:

@@ -25,7 +25,7 @@ from sitl.campaign.kernel import LANES
 from sitl.campaign.parts import Parts, missing_ranges
 from sitl.campaign.tasks import fly, is_compiled
 
-__all__ = ["Outcome", "run"]
+__all__ = ["WITHOUT_SCHEDULER", "Outcome", "run"]
 
 TASK_S = 1.0
 """What a task shall take."""
@@ -47,6 +47,9 @@ MAX_ROWS_KEPT = 1 << 25
 
 RETRIES = 3
 """How often a task that fails is tried again."""
+
+WITHOUT_SCHEDULER = ("local", "none")
+"""What is no scheduler's address."""
 
 Told = Callable[[int], None]
 Range = tuple[int, int]
@@ -104,15 +107,15 @@ def run(
     if parts is None and campaign.flights > MAX_ROWS_KEPT:
         raise InputError(f"flights: expected at most {MAX_ROWS_KEPT} without a folder (-o), found {campaign.flights}")
     workers = workers or len(os.sched_getaffinity(0))
-    ranges = missing_ranges([] if parts is None else parts.found(), campaign.flights)
+    names = list(fly(campaign, 0, 1))  # compiled, or loaded
+    ranges = missing_ranges([] if parts is None else parts.found(names), campaign.flights)
     told(campaign.flights - sum(stop - start for start, stop in ranges))
     collected = _Collected(parts, told)
-    fly(campaign, 0, 1)  # compiled, or loaded
     begun = time.perf_counter()
     ranges, per_flight_s = _timed(campaign, ranges, collected)
     left_s = per_flight_s * sum(stop - start for start, stop in ranges)
     tasks = _tasks(ranges, per_flight_s, min(max(left_s / (SHARES * workers), LEAST_S), TASK_S))
-    if scheduler not in ("local", "none"):
+    if scheduler not in WITHOUT_SCHEDULER:
         workers = _with_dask(campaign, tasks, collected, scheduler, workers)
     elif scheduler == "local" and left_s > WORTH_S and workers > 1 and not is_compiled(campaign):
         workers = _with_dask(campaign, tasks, collected, None, workers)

@@ -8,10 +8,13 @@ are: nothing needs to be known of the system.
 
 The estimate is unbiased for any N and K, in discrete time and with scores that tie, because all ties with the level
 are killed and the sample that jumps over it is kept (Bréhier et al.). What a single run is worth nobody can tell from
-that run, so several independent ones are flown, and their spread is the interval.
+that run, so several independent ones are flown, and their spread is the interval. Their estimates are skewed, most of
+them low and a few far above: Student's interval would be too short at its upper end, and is studentised by resampling
+instead (Efron's bootstrap-t).
 
 References
 ----------
+B. Efron, "Nonparametric standard errors and confidence intervals", Canad. J. Statist. 9(2), 1981.
 F. Cérou, A. Guyader, "Adaptive multilevel splitting for rare event analysis", Stoch. Anal. Appl. 25(2), 2007.
 C.-E. Bréhier, M. Gazeau, L. Goudenège, T. Lelièvre, M. Rousset, "Unbiasedness of some generalized adaptive multilevel
 splitting algorithms", Ann. Appl. Probab. 26(6), 2016.
@@ -28,13 +31,12 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import t as student
 
 from gains.model import Matrix
 from gains.table import InputError
 from sitl.aircraft.linear import DIVERGED
 from sitl.aircraft.plants import is_nonlinear
-from sitl.campaign.intervals import CONFIDENCE, plain
+from sitl.campaign.intervals import CONFIDENCE, plain, proportion
 from sitl.campaign.job import Campaign
 
 __all__ = ["LEAST", "MAX_REPLICAS", "MIN_REPLICAS", "Descent", "Paths", "RareEvent", "event_of", "rare", "split"]
@@ -44,8 +46,13 @@ LEAST = 1e-30
 
 MIN_REPLICAS, MAX_REPLICAS = 10, 10_000
 
-_STREAM = 0x5911
-"""Of the seeds: which survivors are copied."""
+UNSURE = 0.8
+"""Standard deviation of the replicas over their mean beyond which the interval is not believed."""
+
+_STREAM, _RESAMPLED = 0x5911, 0xB007
+"""Of the seeds: which survivors are copied, and which replicas are drawn again."""
+
+_RESAMPLES = 3999
 
 Integers = NDArray[np.int64]
 
@@ -133,8 +140,9 @@ class RareEvent:
     probability : float
         Of one flight's failure: the mean over the replicas.
     low, high : float
-        Its interval of Student's t, not below 0. Where the relative error is large the replicas are skewed, and the
-        interval is too short. Nothing is known, nan, above where no replica found a failure.
+        Its interval, of the bootstrap-t within [0, 1]; of Clopper and Pearson where no replica had a level, and so all
+        flights are independent. Nothing is known above, nan, where the replicas are all the same, as where none found
+        a failure.
     confidence : float
     relative_error : float
         Standard error of the probability over it; nan where that is 0.
@@ -176,9 +184,14 @@ class RareEvent:
         """How many times more flights plain Monte Carlo needs."""
         return self.plain_flights_for_the_same_error / self.flights
 
+    @property
+    def unsure(self) -> bool:
+        """Whether the interval is not to be believed: the replicas differ so much that few of them say it all."""
+        return not self.relative_error * math.sqrt(len(self.replicas)) <= UNSURE
+
     def to_json(self) -> dict[str, Any]:
         """Return it all as JSON has it, null for what is not known."""
-        return {**plain(self), "efficiency": plain(self.efficiency)}
+        return {**plain(self), "efficiency": plain(self.efficiency), "unsure": self.unsure}
 
 
 def rare(
@@ -209,7 +222,7 @@ def rare(
     seed : int, optional
         Of everything random; by default the campaign's. The same one gives the same result to the last bit.
     workers : int
-        Threads; of no effect on the result.
+        Threads, fewer where their paths would not fit into ``MAX_CELLS`` together; of no effect on the result.
     told : callable
         Told how many replicas more are done.
 
@@ -218,7 +231,7 @@ def rare(
     InputError
         When the plant is not linear, the delays cannot be drawn anew from any sample on, or a number is out of range.
     """
-    from sitl.campaign.branching import FlightPaths  # with numba
+    from sitl.campaign.branching import MAX_CELLS, FlightPaths  # with numba
 
     killed = max(1, particles // 10) if killed is None else killed
     _check(campaign, threshold, particles, killed, replicas)
@@ -233,7 +246,8 @@ def rare(
         return found
 
     found = [descend(0)]  # which compiles
-    with ThreadPoolExecutor(workers) as pool:
+    at_once = max(1, min(workers, MAX_CELLS // (particles * campaign.samples)))
+    with ThreadPoolExecutor(at_once) as pool:
         found += pool.map(descend, range(1, replicas))
     return event_of(found, threshold, particles, killed, drawn)
 
@@ -257,13 +271,18 @@ def event_of(
     estimates = np.array([one.probability for one in found])
     mean = float(np.mean(estimates))
     error = float(np.std(estimates, ddof=1)) / math.sqrt(len(found))
-    half = float(student.ppf(0.5 + CONFIDENCE / 2.0, len(found) - 1)) * error
     relative = error / mean if mean > 0.0 else math.nan
+    if any(one.levels for one in found):
+        low, high = _bootstrap_t(estimates, campaign.seed)
+    else:
+        flown = particles * len(found)
+        exact = proportion(round(mean * flown), flown, CONFIDENCE)
+        low, high = exact.low, exact.high
     return RareEvent(
         threshold=threshold,
         probability=mean,
-        low=max(0.0, mean - half),
-        high=mean + half if mean > 0.0 else math.nan,
+        low=low,
+        high=high,
         confidence=CONFIDENCE,
         relative_error=relative,
         replicas=tuple(one.probability for one in found),
@@ -277,3 +296,20 @@ def event_of(
         flights=sum(one.paths for one in found),
         plain_flights_for_the_same_error=(1.0 - mean) / (mean * relative**2) if relative > 0.0 else math.nan,
     )
+
+
+def _bootstrap_t(estimates: Matrix, seed: int) -> tuple[float, float]:
+    """Return the interval of the mean whose t is distributed as that of samples drawn from the sample itself."""
+    count, mean = len(estimates), float(np.mean(estimates))
+    error = float(np.std(estimates, ddof=1))
+    if error == 0.0:
+        return 0.0, math.nan
+    rng = np.random.Generator(np.random.PCG64(np.random.SeedSequence(seed, spawn_key=(_RESAMPLED,))))
+    t = np.empty(_RESAMPLES)
+    for n in range(_RESAMPLES):
+        again = estimates[rng.integers(count, size=count)]
+        away, spread = float(np.mean(again)) - mean, float(np.std(again, ddof=1))
+        t[n] = away / spread if spread > 0.0 else math.copysign(math.inf, away)
+    tail = 0.5 - CONFIDENCE / 2.0
+    least, most = np.quantile(t, (tail, 1.0 - tail), method="inverted_cdf")
+    return max(0.0, mean - float(most) * error), min(1.0, mean - float(least) * error)

@@ -32,7 +32,7 @@ def campaign_tables(
     """
     told = measured or measure(columns, eta=description.get("eta"), threshold=threshold)
     tables = [
-        _grid(words.failures(told), words.title(description, told), words.verdict(told)[0]),
+        _grid(words.failures(description, told), words.title(description, told), words.verdict(told)[0]),
         _grid(_stacked(words.quantile_table(description, told)), "Quantiles"),
     ]
     for found, result in ((told.rms_sensitivity, "rms error"), (told.gain_sensitivity, "gain")):

@@ -161,18 +161,23 @@ def _bound_of(told: Proportion, does: str, confidence: float) -> str:
     """Return the sentence about one probability."""
     opening = f"With {_percent(confidence)} confidence, a flight drawn like these {does} with a probability"
     if told.count == 0:
-        return f"{opening} below {chance(told.upper, ROUND_CEILING)}."
+        return f"{opening} of at most {chance(told.high, ROUND_CEILING)}."
     return f"{opening} between {chance(told.low, ROUND_FLOOR)} and {chance(told.high, ROUND_CEILING)}."
 
 
 # -- tables
 
 
-def failures(statistics: Statistics) -> Table:
+def failures(description: Mapping[str, Any], statistics: Statistics) -> Table:
     """Return how many flights failed, and how probable that is."""
     kinds = [("diverged", statistics.diverged)]
     if statistics.beyond is not None:
-        kinds.append((f"error beyond {finite(statistics.threshold or 0.0, 4)}, or diverged", statistics.beyond))
+        kinds.append(
+            (
+                f"error beyond {finite(statistics.threshold or 0.0, 4)}{_unit(description)}, or diverged",
+                statistics.beyond,
+            )
+        )
     if statistics.above is not None:
         kinds.append(("gain above η, inside the window", statistics.above))
     kinds += [("failed in any of these ways", statistics.failed), ("left the window", statistics.left_window)]
@@ -354,6 +359,11 @@ def _p_value(p: float) -> str:
     return "< 1e-300" if p < 1e-300 else chance(p)
 
 
+def _equal_to(p: float) -> str:
+    said = _p_value(p)
+    return said if said.startswith("<") else f"= {said}"
+
+
 def _ratio(log_ratio: float) -> str:
     """Return a ratio from its logarithm, however large."""
     try:
@@ -381,7 +391,7 @@ def _pair_sentences(pair: Pair) -> list[str]:
         distinct = pair.p_failures < 1.0 - pair.confidence
         said.append(
             f"{_count(pair.only_a_failed)} failed with {pair.a} alone, {pair.only_b_failed:,} with {pair.b} alone:"
-            f" {'more than' if distinct else 'no more than'} chance explains (p = {_p_value(pair.p_failures)})."
+            f" {'more than' if distinct else 'no more than'} chance explains (p {_equal_to(pair.p_failures)})."
         )
     if pair.both_diverged:
         said.append(f"In {_count(pair.both_diverged)} both diverged; of errors these decide nothing.")

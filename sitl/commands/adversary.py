@@ -95,7 +95,10 @@ def _show(told: dict[str, object]) -> None:
     table = Table("", "", show_header=False)
     eta, ratio = told["eta"], told["ratio"]
     table.add_row("largest ‖e‖/‖v‖ found", f"{told['gain']:.6g}")
-    table.add_row("η, proved", f"{told['eta_source']}" if eta is None else f"{eta:.6g} ({told['eta_source']})")
+    table.add_row(
+        "η, proved",
+        f"none for this window: {told['eta_source']}" if eta is None else f"{eta:.6g} ({told['eta_source']})",
+    )
     if isinstance(ratio, float):
         table.add_row("of η", f"{100.0 * ratio:.1f} %")
     table.add_row("delays", f"{told['d_min']} to {told['d_max']}, {told['transitions']}; {told['samples']} samples")

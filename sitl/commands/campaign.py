@@ -27,7 +27,11 @@ __all__ = ["campaign"]
 @click.option("--scheduler", default="local", show_default=True, metavar="ADDRESS",
               help="A Dask scheduler, tcp://HOST:PORT; local: this machine's cores; none: this process.")  # fmt: skip
 @click.option("--workers", type=click.IntRange(1, 1024), help="Of this machine; default: one per core.")
-@click.option("--threshold", "threshold_text", help="An error beyond it is a failure, too: 0.5deg, for example.")
+@click.option(
+    "--threshold",
+    "threshold_text",
+    help="An error beyond it is a failure, too: 0.5deg, for example; without a unit in the output's, radians.",
+)
 @click.option("-o", "--output", "folder", type=click.Path(file_okay=False, path_type=Path),
               help="Folder for the results of every flight, as Parquet; one with results is gone on with.")  # fmt: skip
 @click.option("--page", type=FILE, help="Write an HTML page.")
@@ -59,7 +63,7 @@ def campaign(
     sitl campaign --gains hirm-paper --link lte --flights 10000 --page lte.html
     sitl campaign --gains hirm-d3 --gains hirm-d6 --delays geometric:2
 
-    The exit code is 1 when a flight diverged, or exceeded η inside the window.
+    The exit code is 1 when a flight diverged, erred beyond the threshold, or exceeded η inside the window.
     """
     for file in (page, worst):
         if file is not None:
@@ -71,6 +75,9 @@ def campaign(
     from sitl.campaign.conducting import conduct
     from sitl.link.presets import parse_link
 
+    twice = next((name for name in gains_names if gains_names.count(name) > 1), None)
+    if twice is not None:
+        raise InputError(f"--gains: expected different ones to compare, found {twice} twice")
     laws = {name: require_law(load_law(name)) for name in gains_names}
     first = laws[gains_names[0]]
     link = None if preset is None and up is None and down is None else parse_link(preset, up, down)

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, fields
 from functools import wraps
 from typing import TYPE_CHECKING, Any, Literal
 
 import click
+import numpy as np
 
 from gains.command import FiniteRange
 from gains.proving import parse_window
@@ -30,7 +32,8 @@ _OPTIONS = (
     click.option("--transitions", type=click.Choice(["any", "fifo"]), default="any", show_default=True,
                  help="fifo: a delay exceeds the one before by at most one sample."),
     click.option("--gust", default="sine:0..3.5deg:0.5s..10s", show_default=True,
-                 help="none, step:A, sine:A[:T], square:A[:T] or white:A, with numbers or spans LOW..HIGH."),
+                 help="none, step:A, sine:A[:T], square:A[:T] or white:A; A and T numbers or spans LOW..HIGH, A in"
+                 " the channel's unit, radians of an angle, without one."),
     click.option("--reference", default="square:0..5deg:1s..10s", show_default=True,
                  help="Likewise; of no meaning without a reference model."),
     click.option("--delta", default="0", show_default=True, help="Amplitude of the uncertainty, or a span."),
@@ -106,6 +109,7 @@ class Draws:
         own = (first or law).model
         plant = own if self.plant is None else plant_model(self.plant, own)
         _check_fit(law, plant)
+        _check_references(first or law, law)
         d_min, d_max = self.window_of(first or law)
         job = Campaign(
             law=law,
@@ -164,7 +168,9 @@ def one_number(text: str, option: str) -> float:
     """
     from sitl.campaign.distributions import parse_span
 
-    low, high = parse_span(text, f'{option} "{text}"')
+    low = high = 0.0
+    with suppress(InputError):  # what is no number, as what is none above 0
+        low, high = parse_span(text, option)
     if low != high or low <= 0.0:
         raise InputError(f'{option} "{text}": expected a number above 0, such as 2deg')
     return high
@@ -185,6 +191,20 @@ def _check_fit(law: GainLaw, plant: Model) -> None:
         raise InputError(
             f"gains {law.name}: expected a plant with states {', '.join(law.model.states)} at Ts {law.model.Ts} s,"
             f" found {plant.name} with {', '.join(plant.states)} at {plant.Ts} s"
+        )
+
+
+def _check_references(first: GainLaw, law: GainLaw) -> None:
+    """Refuse to compare laws that do not track the same: errors from references of their own are no pairs."""
+    one, other = first.model.reference, law.model.reference
+    if one is None or other is None:
+        same = one is other
+    else:
+        same = all(np.array_equal(getattr(one, name), getattr(other, name)) for name in ("Ar", "Br", "Cr"))
+    if not same:
+        raise InputError(
+            f"--gains: expected gains with the same reference model to compare, found {first.name} and {law.name}"
+            " with others"
         )
 
 

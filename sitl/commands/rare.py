@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from typing import TYPE_CHECKING, Any
 
@@ -15,9 +16,6 @@ if TYPE_CHECKING:
     from sitl.campaign.splitting import RareEvent
 
 __all__ = ["rare_command"]
-
-UNSURE = 0.3
-"""Relative error beyond which Student's interval is not believed."""
 
 
 @click.command("rare")
@@ -48,7 +46,7 @@ def rare_command(
 
     \b
     sitl rare --gains hirm-paper --delays geometric:3 --threshold 2.5deg
-    sitl rare --gains pendulum-paper --delays geometric:2 --gust step:0.1deg --threshold 1
+    sitl rare --gains hirm-d3 --delays geometric:3 --threshold 3deg --replicas 40
 
     Flights that come near failure are copied, and their future drawn anew. Gust and reference come along, so this
     serves failures that delays bring about. The exit code is 1 when no failure was found.
@@ -115,9 +113,10 @@ def _rows(event: RareEvent) -> list[tuple[str, str]]:
     if event.probability == 0.0:
         return [("probability", f"none of {count} replicas found a failure"), *work]
     found = sum(estimate > 0.0 for estimate in event.replicas)
+    high = "?" if math.isnan(event.high) else f"{event.high:.3g}"
     estimate = [
         ("probability per flight", f"{event.probability:.3g}"),
-        (f"{100 * event.confidence:g} % interval", f"{event.low:.3g} to {event.high:.3g}"),
+        (f"{100 * event.confidence:g} % interval", f"{event.low:.3g} to {high}"),
         ("relative error", f"{100.0 * event.relative_error:.1f} %"),
         ("replicas that found failures", f"{found} of {count}"),
         ("first flights they stem from, mean", f"{sum(event.roots) / count:.1f} of {event.particles:,}"),
@@ -133,7 +132,7 @@ def _caption(event: RareEvent) -> str:
     """Return what a reader must know before believing it."""
     if event.probability == 0.0:
         return "Rarer than can be told from these particles: more of them, or a lower threshold."
-    if event.relative_error > UNSURE:
+    if event.unsure:
         return (
             "The replicas differ much: no more than the order of magnitude is known, and it is likelier too low. More"
             " particles help."

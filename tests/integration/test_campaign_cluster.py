@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import socket
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -42,14 +44,24 @@ def test_links_are_sampled_by_a_cluster_as_by_one_process(dask: LocalCluster, tm
 
 
 @pytest.mark.parametrize(
-    "address", ["", "nonsense", "tcp://", "tcp://127.0.0.1", "127.0.0.1:8786", "tcp://127.0.0.1:x", "gopher://there:70"]
+    "address",
+    [
+        "",
+        "nonsense",
+        "tcp://",
+        "tcp://127.0.0.1",
+        "127.0.0.1:8786",
+        "tcp://127.0.0.1:x",
+        "gopher://there:70",
+        "tls://127.0.0.1:8786",
+    ],
 )
 def test_what_is_no_address_is_refused_on_one_line(address: str) -> None:
     with pytest.raises(InputError, match="expected local, none or tcp://HOST:PORT"):
         run(campaign(), scheduler=address)
 
 
-@pytest.mark.parametrize("address", ["tcp://10.0.0.7:8786", "tls://dask.example.org:8786", "tcp://[::1]:8786"])
+@pytest.mark.parametrize("address", ["tcp://10.0.0.7:8786", "tcp://dask.example.org:8786", "tcp://[::1]:8786"])
 def test_addresses_of_schedulers_are_asked(address: str, monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[str] = []
 
@@ -57,10 +69,41 @@ def test_addresses_of_schedulers_are_asked(address: str, monkeypatch: pytest.Mon
         asked.append(address)
         raise OSError("nobody is there")
 
+    monkeypatch.setattr(cluster, "require_scheduler", lambda _: None)
     monkeypatch.setattr(distributed, "Client", nobody)
     with pytest.raises(InputError, match="nobody is there"):
         run(campaign(), scheduler=address)
     assert asked == [address]
+
+
+@pytest.mark.parametrize("greeting", [b"", b"SSH-2.0-OpenSSH_9.2p1\r\n", b"HTTP", b"\0" * 16, None])
+def test_what_greets_otherwise_than_a_scheduler_is_refused_on_one_line(
+    greeting: bytes | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(cluster, "PATIENCE_S", 0.3)
+    over = threading.Event()
+    with socket.create_server(("127.0.0.1", 0)) as server:
+
+        def greet() -> None:
+            peer, _ = server.accept()
+            with peer:
+                if greeting is None:  # as a web server, which waits to be asked
+                    over.wait(30.0)
+                else:
+                    peer.sendall(greeting)
+
+        thread = threading.Thread(target=greet)
+        thread.start()
+        with pytest.raises(InputError) as refused:
+            cluster.require_scheduler(f"tcp://127.0.0.1:{server.getsockname()[1]}")
+        over.set()
+        thread.join()
+    assert "scheduler" in str(refused.value)
+    assert "\n" not in str(refused.value)
+
+
+def test_a_scheduler_is_one(dask: LocalCluster) -> None:
+    cluster.require_scheduler(dask.scheduler_address)
 
 
 def test_workers_of_another_version_are_refused(dask: LocalCluster, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -171,11 +171,12 @@ def test_the_cluster_of_this_machine_flies_the_same(tmp_path: Path, monkeypatch:
 
 @pytest.mark.long
 def test_a_scheduler_that_nobody_is_at_ends_with_2_and_one_line(tmp_path: Path) -> None:
-    line = ("sitl", "campaign", "--gains", "hirm-paper", "--flights", "100", "--scheduler", "tcp://127.0.0.1:9")
+    line = (*LINE, "100", "-o", str(tmp_path / "out"), "--scheduler", "tcp://127.0.0.1:9")
     with program(tmp_path, *line) as flying:
         assert flying.wait(120.0) == 2
         assert flying.stdout == ""
         assert_one_line(flying, "tcp://127.0.0.1:9")
+    assert not (tmp_path / "out").exists()
 
 
 def assert_one_line(flying: Program, named: str) -> None:

@@ -465,6 +465,8 @@ def test_a_unit_at_the_end_of_a_span_counts_for_both_ends() -> None:
     assert parse_span("1rad..180deg", "x") == pytest.approx((1.0, math.pi), rel=1e-15)
     with pytest.raises(InputError, match="LOW"):
         parse_span("1deg..2", "x", {"deg": DEG})
+    with pytest.raises(InputError, match="LOW"):
+        parse_span("5deg..10", "x")  # 10 of what?
 
 
 # -- the loop

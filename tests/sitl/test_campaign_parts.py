@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from gains.model import Gains
 from gains.table import InputError
+from sitl.aircraft.aerodynamics import stored_aircraft
 from sitl.campaign import run as running
 from sitl.campaign.distributions import Span, parse_delays, parse_signal
 from sitl.campaign.engine import fly_range
@@ -148,6 +151,19 @@ def test_what_is_damaged_is_flown_again_and_the_rest_is_not(tmp_path: Path, dama
     assert pq.read_table(tmp_path).num_rows == 1000  # what is of no use is passed over by other tools, too
 
 
+@pytest.mark.parametrize("wrong", ["flights", "columns"])
+def test_a_part_of_other_flights_or_columns_than_its_name_says_is_put_aside(tmp_path: Path, wrong: str) -> None:
+    job = campaign(flights=100)
+    parts = parts_in(tmp_path, job)
+    parts.write(0, 50, fly_range(job, 0, 50))
+    table = fly_range(job, 0, 50) if wrong == "flights" else fly_range(job, 50, 100)
+    parts.write(50, 100, {name: column for name, column in table.items() if wrong == "flights" or name != "growth"})
+    again = parts_in(tmp_path, job)
+    outcome = run(job, scheduler="none", workers=1, parts=again)
+    assert (outcome.flown, again.aside) == (50, 1)
+    assert equal(outcome.columns, fly_range(job, 0, 100))
+
+
 def test_parts_that_overlap_count_once(tmp_path: Path) -> None:
     job = campaign(flights=200)
     parts = parts_in(tmp_path, job)
@@ -169,6 +185,53 @@ def test_results_of_another_campaign_are_left_alone(tmp_path: Path, change: dict
     with pytest.raises(InputError, match="another"):
         parts_in(tmp_path, campaign(**change))
     parts_in(tmp_path, campaign(flights=5))  # how many there are does not tell campaigns apart
+
+
+def of_plant(**changes: Any) -> Campaign:
+    base = campaign(limits=True)
+    return replace(base, plant=replace(base.plant, **changes))
+
+
+def test_a_plant_that_differs_in_anything_that_flies_is_another_campaign() -> None:
+    plant = campaign().plant
+    assert plant.actuator is not None
+    assert plant.actuator.low is not None
+    others = [
+        of_plant(actuator=None),
+        of_plant(actuator=replace(plant.actuator, low=1.0001 * plant.actuator.low)),
+        of_plant(trim=replace(plant.trim, u=plant.trim.u + 1e-3)),
+        of_plant(trim=replace(plant.trim, x=plant.trim.x + 1e-3)),
+        of_plant(A=plant.A * (1.0 + 1e-12)),  # less than a proof tells apart
+        of_plant(),
+    ]
+    law = campaign().law
+    assert isinstance(law, Gains)
+    others += [campaign(law=replace(law, K1=law.K1 * (1.0 + 1e-12))), campaign(law=replace(law, d_max=5))]
+    reference = law.model.reference
+    assert reference is not None
+    other_reference = replace(law.model, reference=replace(reference, Br=reference.Br * (1.0 + 1e-12)))
+    others += [campaign(law=replace(law, model=other_reference))]
+    assert len({identity(one) for one in others}) == len(others)
+
+
+def test_names_notes_and_certificates_do_not_tell_campaigns_apart() -> None:
+    base = campaign()
+    assert isinstance(base.law, Gains)
+    renamed = replace(base.law, name="other", certificate=None, model=replace(base.law.model, name="copy"))
+    again = campaign(law=renamed, plant=replace(base.plant, name="copy"), plant_name="copy.toml")
+    assert identity(again) == identity(base)
+
+
+def test_an_aircraft_file_that_changed_is_another_campaign(tmp_path: Path) -> None:
+    path = tmp_path / "mine.toml"
+    stored = stored_aircraft()["hirm"].read_text()
+    path.write_text(stored)
+    before = identity(campaign(plant_name=f"sixdof:{path}"))
+    path.write_text(f"# a note\n{stored}")
+    assert identity(campaign(plant_name=f"sixdof:{path}")) == before
+    first = next(line for line in stored.splitlines() if line.startswith("thrust"))
+    path.write_text(stored.replace(first, "thrust = 12345.0"))
+    assert identity(campaign(plant_name=f"sixdof:{path}")) != before
 
 
 def test_a_folder_of_something_else_is_left_alone(tmp_path: Path) -> None:
@@ -209,4 +272,4 @@ def test_a_part_is_there_whole_or_not_at_all(tmp_path: Path, monkeypatch: pytest
     with pytest.raises(InputError, match="No space left"):
         parts.write(0, 10, fly_range(job, 0, 10))
     assert [path.name for path in tmp_path.iterdir()] == ["_campaign.json"]
-    assert parts_in(tmp_path, job).found() == []
+    assert parts_in(tmp_path, job).found(()) == []

@@ -24,8 +24,8 @@ from scipy.linalg import expm
 
 import sitl.__main__
 from gains.command import run as run_command
-from gains.store import load_gains, resolve
-from gains.witnessfile import read_witness
+from gains.store import load_gains, load_model, resolve
+from gains.witnessfile import read_witness, sequence_of, write_witness
 from sitl.campaign import parts as keeping
 from sitl.campaign import run as running
 from sitl.campaign.engine import Columns
@@ -93,10 +93,11 @@ def test_of_any_files_the_parts_that_count_and_the_missing_are_every_flight_once
     with tempfile.TemporaryDirectory() as place, pytest.MonkeyPatch.context() as patched:
         folder = Path(place)
         parts = Parts(folder, "of this campaign", {})
-        patched.setattr(keeping, "_rows", lambda path: int(path.read_text()))
+        patched.setattr(keeping, "_is_whole", lambda path, start, stop, _: int(path.read_text()) == stop - start > 0)
         for start, size in pieces:
             (folder / f"flights-{start:012d}-{start + size:012d}.parquet").write_text(str(size))
-        found = parts.found()
+        found = parts.found(())
+        assert parts.aside == len(list(folder.glob("_aside-*")))
         aside = list(folder.glob("_aside-*"))
         assert len(found) + len(aside) == len(pieces)  # nothing is deleted
         assert {part.path for part in found} == set(folder.glob("flights-*"))
@@ -127,11 +128,11 @@ def test_a_run_flies_what_is_missing_exactly_once_and_tells_of_each_flight(
             flown[start:stop] += 1
         return {"flight": np.arange(start, stop), "square": np.arange(start, stop) ** 2}
 
-    parts = parts_in(tmp_path, job)
+    parts, names = parts_in(tmp_path, job), {"flight": np.arange(1), "square": np.arange(1)}
     for start, stop in kept:
         parts.write(start, stop, count(job, start, stop))
     # a first flight, of which nothing is kept, compiles
-    monkeypatch.setattr(running, "fly", lambda job, a, b: {} if (a, b) == (0, 1) else count(job, a, b))
+    monkeypatch.setattr(running, "fly", lambda job, a, b: names if (a, b) == (0, 1) else count(job, a, b))
     monkeypatch.setattr(running, "_timed", lambda _job, ranges, _collected: (ranges, 1e-3))
     outcome = running.run(job, scheduler="none", workers=workers, parts=parts_in(tmp_path, job), told=told.append)
     assert (flown[:500] == 1).all()
@@ -209,8 +210,8 @@ def test_after_damage_the_same_command_has_the_same_rows(command: Command, tmp_p
     victim.write_bytes(victim.read_bytes()[:-20])
     (tmp_path / "out" / ".flights-000000000064-000000000128.4711.tmp").write_bytes(b"PAR1")
     again = command(f"{SMALL} --json -o out").json
-    assert again["flown_now"] == rows
-    passing = {"flown_now", "seconds", "plant_steps_per_s", "workers"}
+    assert (again["flown_now"], again["put_aside"]) == (rows, 1)
+    passing = {"flown_now", "put_aside", "seconds", "plant_steps_per_s", "workers"}
     assert {name: told[name] for name in told.keys() - passing} == {name: again[name] for name in told.keys() - passing}
     assert equal(table_in(tmp_path / "out"), expected)
 
@@ -269,6 +270,25 @@ def test_a_witness_diverges_as_its_file_predicts_and_ends_with_1(command: Comman
     assert told["failure_probability"]["count"] == 32
     calm = command(f"{line} --scheduler none --json --delays hold:0.5")
     assert (calm.code, calm.json["diverged"], calm.json["growth_per_sample"]) == (0, 0, None)
+
+
+def test_growth_is_told_of_the_plant_that_flies_where_it_grows(command: Command, tmp_path: Path) -> None:
+    sequence = tmp_path / "four.csv"
+    write_witness(sequence, sequence_of((4,), 0.025, "hirm-paper", "hirm"))
+    text = resolve("hirm").read_text()
+    assert "[actuator]" in text
+    weak = re.sub(r"(?m)^B = .*$", "B = [[0.0], [0.0], [0.0]]", text)
+    assert weak != text
+    (tmp_path / "weak.toml").write_text(weak)
+    line = f"--gains hirm-paper --flights 8 --samples 60 --json --scheduler none --delays cycle:{sequence} --plant"
+    open_loop = command(f"{line} weak.toml").json["growth_per_sample"]
+    eigenvalues = np.linalg.eigvals(load_model(str(tmp_path / "weak.toml")).A)
+    assert open_loop["predicted"] == pytest.approx(np.abs(eigenvalues).max(), rel=1e-9)
+    assert command(f"{line} weak.toml --limits --worst w.csv").json["growth_per_sample"]["predicted"] is None
+    assert read_witness(tmp_path / "w.csv").growth_per_sample is None
+    stable = command(f"{line} hirm").json["growth_per_sample"]
+    assert stable["predicted"] < 1.0
+    assert stable["measured"] is None  # the largest |x| so far cannot fall
 
 
 def test_the_file_of_the_worst_flight_has_the_largest_gain_in_a_plain_loop(command: Command, tmp_path: Path) -> None:
@@ -354,6 +374,13 @@ def test_without_json_the_tables_say_the_same_failures(command: Command) -> None
 # -- what is refused
 
 
+def with_other_reference(folder: Path) -> str:
+    """Return a gain file of a model that is hirm but for its reference, and write that model."""
+    model, gains = resolve("hirm").read_text(), resolve("hirm-paper").read_text()
+    (folder / "fast.toml").write_text(model.replace("Br = [[0.0056], [0.1190]", "Br = [[0.0066], [0.1190]"))
+    return gains.replace('model = "hirm"', 'model = "fast.toml"')
+
+
 @pytest.mark.parametrize(
     ("line", "named"),
     [
@@ -389,6 +416,12 @@ def test_without_json_the_tables_say_the_same_failures(command: Command) -> None
         (f"{SMALL} -o other", "another"),
         (f"{SMALL} --gains {' --gains '.join(f'copy{n}.toml' for n in range(6))}", "at most 6"),
         ("--gains a/same.toml --gains b/same.toml --flights 9 -o out", "same twice"),
+        (f"{SMALL} --gains hirm-d4 --gains hirm-d4", "hirm-d4 twice"),
+        (f"{SMALL} --gains faster.toml", "same reference model"),
+        (f"{SMALL} --gust sine:5deg..10", "LOW..HIGH"),
+        (f"{SMALL} --threshold=-1deg", "a number above 0, such as"),
+        (f"{SMALL} --plant sixdof:hirm --wind dryden:moderat", "light, moderate, severe"),
+        (f"{SMALL} --scheduler tcp://127.0.0.1:9 -o out", "tcp://127.0.0.1:9"),
     ],
 )
 def test_bad_input_ends_with_2_and_one_line_that_names_it(
@@ -397,6 +430,7 @@ def test_bad_input_ends_with_2_and_one_line_that_names_it(
     for name in (*(f"copy{n}.toml" for n in range(6)), "a/same.toml", "b/same.toml"):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_bytes(resolve("hirm-paper").read_bytes())
+    (tmp_path / "faster.toml").write_text(with_other_reference(tmp_path))
     (tmp_path / "file").write_text("a file")
     (tmp_path / "foreign").mkdir()
     (tmp_path / "foreign" / "thesis.tex").write_text("work of years")
@@ -413,6 +447,7 @@ def test_bad_input_ends_with_2_and_one_line_that_names_it(
     assert said.err.index("\n") == len(said.err) - 1
     assert named in said.err
     assert [path.name for path in (tmp_path / "foreign").iterdir()] == ["thesis.tex"]
+    assert not (tmp_path / "out" / "_campaign.json").exists()
 
 
 @pytest.mark.parametrize("missing", ["numba", "pyarrow"])

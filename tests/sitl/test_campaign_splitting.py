@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections import Counter
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from typing import Any
 
@@ -17,13 +18,14 @@ from scipy import stats
 from gains.model import Gains
 from gains.store import load_law, require_law
 from gains.table import InputError
+from sitl.campaign import branching, splitting
 from sitl.campaign.airframes import fly_one
 from sitl.campaign.branching import MAX_CELLS, FlightPaths, tails_of
 from sitl.campaign.distributions import DelayProcess, Signal, Span, parse_delays, parse_signal
 from sitl.campaign.engine import drawn_block, fly_range
 from sitl.campaign.job import Campaign
 from sitl.campaign.kernel import MAX_DELAY
-from sitl.campaign.splitting import LEAST, Descent, event_of, rare, split
+from sitl.campaign.splitting import LEAST, Descent, RareEvent, event_of, rare, split
 from sitl.commands.rare import rare_command
 from tests.sitl.campaigns import campaign
 
@@ -360,12 +362,60 @@ def test_divergence_alone_is_judged_by_the_state_and_agrees_with_flying() -> Non
     )
 
 
-def test_the_interval_is_students_of_the_replicas() -> None:
-    found = [Descent(p, 3, 100, 2, False) for p in (1e-9, 3e-9, 2e-9, 2e-9, 4e-9, 1e-9, 2e-9, 1e-9, 3e-9, 1e-9)]
-    event = event_of(found, 0.1, 50, 5, hirm())
-    expected = stats.ttest_1samp([one.probability for one in found], 0.0).confidence_interval(0.95)
-    assert (event.low, event.high) == pytest.approx((expected.low, expected.high), rel=1e-9)
-    assert event.flights == 1000
+def interval_of(estimates: Any, seed: int = 1, levels: int = 3) -> RareEvent:
+    found = [Descent(float(p), levels, 100, 2, False) for p in estimates]
+    return event_of(found, 0.1, 50, 5, hirm(seed=seed))
+
+
+def test_the_interval_of_skewed_replicas_holds_the_mean_more_often_than_students() -> None:
+    rng = np.random.default_rng(7)
+    replicas = rng.lognormal(math.log(2e-9), 0.8, size=(500, 20))  # standard deviation 0.95 of the mean
+    mean = 2e-9 * math.exp(0.32)
+    held = [event.low <= mean <= event.high for event in map(interval_of, replicas)]
+    students = [stats.ttest_1samp(row, 0.0).confidence_interval(0.95) for row in replicas]
+    assert np.mean([low <= mean <= high for low, high in students]) < np.mean(held) - 0.03
+    assert 0.9 < np.mean(held) < 0.98
+
+
+def test_the_interval_of_normal_replicas_is_nearly_students() -> None:
+    replicas = np.random.default_rng(8).normal(1e-3, 1e-4, 200)
+    event, expected = interval_of(replicas), stats.ttest_1samp(replicas, 0.0).confidence_interval(0.95)
+    assert (event.low, event.high) == pytest.approx((expected.low, expected.high), rel=3e-3)
+    assert not event.unsure
+    assert event.flights == 200 * 100
+
+
+def test_replicas_that_scatter_by_their_mean_are_called_unsure() -> None:
+    wild = interval_of([0.0] * 9 + [1e-9])
+    assert wild.unsure
+    assert wild.to_json()["unsure"] is True
+    assert (wild.low, wild.high) == (0.0, 1.0)  # one replica in three finds nothing but zeros when drawn again
+    assert not interval_of([1e-9, 2e-9] * 5).unsure
+
+
+def test_replicas_without_a_level_are_independent_flights_with_an_exact_interval() -> None:
+    certain = interval_of([1.0] * 10, levels=0)
+    expected = stats.binomtest(500, 500).proportion_ci(0.95)
+    assert (certain.low, certain.high) == pytest.approx((expected.low, 1.0))
+    most = interval_of([0.98, 1.0] * 5, levels=0)
+    expected = stats.binomtest(495, 500).proportion_ci(0.95)
+    assert (most.low, most.high) == pytest.approx((expected.low, expected.high))
+
+
+def test_so_many_replicas_at_once_as_fit(monkeypatch: pytest.MonkeyPatch) -> None:
+    pools: list[int] = []
+
+    class Pool(ThreadPoolExecutor):
+        def __init__(self, workers: int) -> None:
+            pools.append(workers)
+            super().__init__(workers)
+
+    monkeypatch.setattr(splitting, "ThreadPoolExecutor", Pool)
+    monkeypatch.setattr(branching, "MAX_CELLS", 3 * 60 * 150)
+    campaign = hirm(samples=150)
+    rare(campaign, math.radians(0.9), particles=60, replicas=10, workers=8)
+    rare(campaign, math.radians(0.9), particles=60, replicas=10, workers=2)
+    assert pools == [3, 2]
 
 
 def test_where_nothing_was_found_nothing_is_claimed() -> None:
