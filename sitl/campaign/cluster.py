@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import re
+import signal
 import socket
 import struct
 from collections.abc import Iterator
@@ -13,7 +14,7 @@ from typing import Any
 from gains.command import version
 from gains.table import InputError
 
-__all__ = ["connected", "require_scheduler"]
+__all__ = ["connected", "dask_setup", "require_scheduler"]
 
 _ADDRESS = re.compile(r"tcp://(\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9.-]+):([0-9]{1,5})")
 
@@ -77,7 +78,8 @@ def connected(address: str | None, workers: int) -> Iterator[Any]:
                     threads_per_worker=1,
                     host="127.0.0.1",
                     dashboard_address="127.0.0.1:0",
-                    silence_logs=logging.ERROR,
+                    silence_logs=logging.CRITICAL,
+                    preload=[__name__],
                 )
             )
             address = cluster.scheduler_address
@@ -94,6 +96,14 @@ def connected(address: str | None, workers: int) -> Iterator[Any]:
                 f'scheduler "{address}": expected workers of lagproof {version()}, found {", ".join(sorted(found))}'
             )
         yield client
+
+
+def dask_setup(_worker: Any) -> None:
+    """Let a worker of this machine pass over Ctrl-C, which a terminal sends to it, too: the command ends it.
+
+    Dask calls this by its name in each worker process that it starts with this module as ``preload``.
+    """
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def _require_dask() -> None:

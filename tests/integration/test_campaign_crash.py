@@ -276,6 +276,20 @@ def test_interrupted_it_ends_with_130_and_goes_on_later(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
+def test_ctrl_c_with_a_cluster_of_its_own_is_quiet_and_leaves_no_worker_behind(tmp_path: Path) -> None:
+    """A terminal sends it to every process of the group."""
+    out = tmp_path / "out"
+    with program(tmp_path, *LINE, "60000", "-o", str(out), "--workers", "2") as flying:
+        eventually("some parts", lambda: len(parts_of(out)) >= 6)
+        workers = [pid for pid in children_of(flying.process.pid) if alive(pid)]
+        assert len(workers) >= 2
+        os.killpg(flying.process.pid, signal.SIGINT)
+        assert flying.wait() == 130
+        assert (flying.stdout, flying.stderr.strip()) == ("", "")
+    eventually("the end of the workers", lambda: not any(alive(pid) for pid in workers))
+
+
+@pytest.mark.long
 def test_killed_with_a_cluster_of_its_own_no_worker_is_left_behind(tmp_path: Path) -> None:
     out = tmp_path / "out"
     with program(tmp_path, *LINE, "6000", "-o", str(out), "--workers", "2") as flying:
