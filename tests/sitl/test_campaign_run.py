@@ -8,6 +8,7 @@ import tempfile
 import threading
 import tomllib
 from collections.abc import Callable
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -28,6 +29,8 @@ from gains.store import load_gains, load_model, resolve
 from gains.witnessfile import read_witness, sequence_of, write_witness
 from sitl.campaign import parts as keeping
 from sitl.campaign import run as running
+from sitl.campaign.bounds import Bound
+from sitl.campaign.conducting import describe
 from sitl.campaign.engine import Columns
 from sitl.campaign.job import Campaign
 from sitl.campaign.parts import Parts, missing_ranges
@@ -369,6 +372,19 @@ def test_without_json_the_tables_say_the_same_failures(command: Command) -> None
     failed = command(f"{SMALL} --threshold 0.2deg --json").json["failure_probability"]["count"]
     assert (said.code, said.err) == (1, "")
     assert re.search(rf"\b{failed}\b", said.out)
+
+
+def test_errors_have_the_unit_of_the_state_that_the_output_is() -> None:
+    def unit_of(**changes: Any) -> str:
+        job = campaign()
+        told = describe("hirm-paper", replace(job, plant=replace(job.plant, **changes)), "uniform", Bound(None, ""))
+        return str(told["unit"])
+
+    assert unit_of() == "rad"
+    assert unit_of(C=np.array([[0.0, 1.0, 0.0]])) == "rad/s"
+    assert unit_of(states=("alpha", "q", "theta"), sensors={}) == ""
+    for C, D in (([[0.0, 0.0, 2.0]], 0.0), ([[1.0, 0.0, 1.0]], 0.0), ([[0.0, 0.0, 1.0]], 1.0)):
+        assert unit_of(C=np.array(C), D=np.array([[D]])) == ""
 
 
 # -- what is refused
