@@ -63,6 +63,11 @@ class Program:
         return self.process.wait(timeout_s)
 
 
+def _mind_ctrl_c() -> None:
+    """Undo what a shell does to what it starts in the background: tests that run there send Ctrl-C all the same."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
 @contextmanager
 def program(folder: Path, *arguments: str, **environment: str) -> Iterator[Program]:
     """Run ``python -m`` with the arguments, in a process group of its own; killed at the end if it still runs."""
@@ -78,6 +83,7 @@ def program(folder: Path, *arguments: str, **environment: str) -> Iterator[Progr
             cwd=folder,
             env={**ENVIRONMENT, **environment},
             start_new_session=True,
+            preexec_fn=_mind_ctrl_c,
         )
     try:
         yield Program(process, out, err)
