@@ -234,6 +234,15 @@ class Model:
         return int(self.E.shape[1])
 
     @property
+    def output_states(self) -> tuple[str, ...]:
+        """Name of the state that each output is by C; "" for one that is scaled, mixed or none."""
+        chosen = [np.flatnonzero(row) for row in self.C]
+        return tuple(
+            self.states[which[0]] if len(which) == 1 and row[which[0]] == 1.0 else ""
+            for row, which in zip(self.C, chosen, strict=True)
+        )
+
+    @property
     def nr(self) -> int:
         """Number of states of the reference model; 0 without one."""
         return 0 if self.reference is None else int(self.reference.Ar.shape[0])

@@ -251,7 +251,7 @@ def _part(part: str, text: str) -> DrydenSpec | GustSpec:
     if kind == "dryden":
         if rest in SEVERITIES:
             return DrydenSpec(rest)
-        if not rest[:1].isdigit():
+        if not rest.endswith("mps"):
             raise _no_wind(text, part)
         return DrydenSpec(_number(rest, "mps", text, above=0.0))
     way, at, start = rest.partition("@")

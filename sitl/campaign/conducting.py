@@ -31,6 +31,10 @@ from sitl.campaign.tables import campaign_tables, comparison_tables
 __all__ = ["Report", "conduct"]
 
 
+_UNITS = {"_rad": "rad", "_rad_s": "rad/s", "_m": "m", "_m_s": "m/s"}
+"""By how the name of a state ends."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Flown:
     """One campaign, what is proved of it, and what became of it."""
@@ -164,15 +168,8 @@ def describe(name: str, job: Campaign, delays: str, bound: Bound) -> dict[str, A
 
 def _unit_of(plant: Model) -> str:
     """Return the unit of the outputs where each of them is a state, whose name says it; "" where that is not known."""
-    units = {"_rad": "rad", "_rad_s": "rad/s", "_m": "m", "_m_s": "m/s"}
-    found = set()
-    for row in np.hstack((plant.C, plant.D)):
-        [*chosen] = np.flatnonzero(row)
-        if len(chosen) != 1 or chosen[0] >= plant.nx or row[chosen[0]] != 1.0:
-            return ""
-        name = plant.states[chosen[0]]
-        found.add(next((units[end] for end in sorted(units, key=len, reverse=True) if name.endswith(end)), ""))
-    return found.pop() if len(found) == 1 else ""
+    found = {next((unit for end, unit in _UNITS.items() if state.endswith(end)), "") for state in plant.output_states}
+    return found.pop() if len(found) == 1 and not plant.D.any() else ""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -106,7 +106,7 @@ def identity(campaign: Campaign) -> str:
         law.model,
         [(gains.d_min, gains.d_max, gains.K1, gains.K2, gains.controller) for gains in sets_of(law)],
     )
-    return hashlib.sha256(repr(_plain((FORMAT, drawn, flown))).encode()).hexdigest()
+    return hashlib.sha256(repr(_canonical((FORMAT, drawn, flown))).encode()).hexdigest()
 
 
 def _aircraft(plant_name: str) -> Any:
@@ -119,16 +119,16 @@ def _aircraft(plant_name: str) -> Any:
     return load_aircraft(name)
 
 
-def _plain(value: Any) -> Any:
+def _canonical(value: Any) -> Any:
     """Return nested tuples of texts and numbers, exact, that are the same for the same data; models lose their name."""
     if isinstance(value, np.ndarray):
-        return value.shape, _plain(value.tolist())
+        return value.shape, _canonical(value.tolist())
     if is_dataclass(value):
         kept = [field.name for field in fields(value) if not (isinstance(value, Model) and field.name == "name")]
-        return type(value).__name__, *((name, _plain(getattr(value, name))) for name in kept)
+        return type(value).__name__, *((name, _canonical(getattr(value, name))) for name in kept)
     if isinstance(value, Mapping):
-        return tuple(sorted((str(key), _plain(item)) for key, item in value.items()))
+        return tuple(sorted((str(key), _canonical(item)) for key, item in value.items()))
     if isinstance(value, tuple | list):
-        return tuple(map(_plain, value))
+        return tuple(map(_canonical, value))
     assert value is None or isinstance(value, str | int | float), type(value)
     return float(value) if isinstance(value, float) else value

@@ -200,9 +200,7 @@ def random_delays(d_min: int, d_max: int, runs: int, transitions: Transitions) -
 
 def output(gains: Gains) -> tuple[str, float]:
     """Return the label of the first output, and the factor from the model's unit to the label's."""
-    row = gains.model.C[0]
-    which = np.flatnonzero(row)
-    state = gains.model.states[which[0]] if len(which) == 1 and row[which[0]] == 1.0 else ""
+    state = gains.model.output_states[0]
     if state.endswith("_rad"):
         return f"{state.removesuffix('_rad').replace('_', ' ')}, deg", math.degrees(1.0)
     return (state or "first output y"), 1.0

@@ -275,14 +275,21 @@ def test_interrupted_it_ends_with_130_and_goes_on_later(tmp_path: Path) -> None:
     assert equal(by_flight(out), fly(linked_as_asked(300), 0, 300))
 
 
-@pytest.mark.long
-def test_ctrl_c_with_a_cluster_of_its_own_is_quiet_and_leaves_no_worker_behind(tmp_path: Path) -> None:
-    """A terminal sends it to every process of the group."""
-    out = tmp_path / "out"
-    with program(tmp_path, *LINE, "60000", "-o", str(out), "--workers", "2") as flying:
+@contextmanager
+def two_workers(folder: Path, flights: int) -> Iterator[tuple[Program, list[int]]]:
+    """Give a command that flies with a cluster of its own and has written some parts, and who works for it."""
+    out = folder / "out"
+    with program(folder, *LINE, str(flights), "-o", str(out), "--workers", "2") as flying:
         eventually("some parts", lambda: len(parts_of(out)) >= 6)
         workers = [pid for pid in children_of(flying.process.pid) if alive(pid)]
         assert len(workers) >= 2
+        yield flying, workers
+
+
+@pytest.mark.long
+def test_ctrl_c_with_a_cluster_of_its_own_is_quiet_and_leaves_no_worker_behind(tmp_path: Path) -> None:
+    """A terminal sends it to every process of the group."""
+    with two_workers(tmp_path, 60000) as (flying, workers):
         os.killpg(flying.process.pid, signal.SIGINT)
         assert flying.wait() == 130
         assert (flying.stdout, flying.stderr.strip()) == ("", "")
@@ -291,14 +298,10 @@ def test_ctrl_c_with_a_cluster_of_its_own_is_quiet_and_leaves_no_worker_behind(t
 
 @pytest.mark.long
 def test_killed_with_a_cluster_of_its_own_no_worker_is_left_behind(tmp_path: Path) -> None:
-    out = tmp_path / "out"
-    with program(tmp_path, *LINE, "6000", "-o", str(out), "--workers", "2") as flying:
-        eventually("some parts", lambda: len(parts_of(out)) >= 6)
-        workers = [pid for pid in children_of(flying.process.pid) if alive(pid)]
-        assert len(workers) >= 2
+    with two_workers(tmp_path, 6000) as (flying, workers):
         flying.end(signal.SIGKILL)
     eventually("the end of the workers", lambda: not any(alive(pid) for pid in workers))
-    kept = by_flight(out)
+    kept = by_flight(tmp_path / "out")
     expected = fly(linked_as_asked(1), 0, int(kept["flight"][40]) + 1)
     assert equal({name: values[:41] for name, values in kept.items()},
                  {name: values[kept["flight"][:41]] for name, values in expected.items()})  # fmt: skip
